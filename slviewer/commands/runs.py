@@ -140,7 +140,7 @@ def _connect_pages(
     from slviewer.server.device_pages import serve_device_pages
     from slviewer.server.secure import serve
 
-    pages, server = PageChannels(), serve(serving, label="slviewer")
+    pages, server = PageChannels(), serve(serving)
     ended.callback(server.stop)
     serve_device_pages(server, pages)
     if server.certificate is not None and server.certificate.self_made:

@@ -53,9 +53,9 @@ class App:
         be served.
         """
         self.operator = operator
-        self.server: SafeServer = serve(serving, label="slviewer")
+        self.server: SafeServer = serve(serving)
         try:
-            if pages is not None:
+            if pages:
                 serve_device_pages(self.server, pages)
             self._context = PanelContext(operator, self.server, pages, print_links)
             page = self.server.viser
@@ -88,7 +88,6 @@ class App:
         self._closing = True
         self._changed.set()
         self._unsubscribe()
-        self._context.executor.shutdown(wait=False, cancel_futures=True)
         self._thread.join(5.0)
         self.server.stop()
 
@@ -120,17 +119,18 @@ class App:
         folder = snapshot.session.folder if snapshot.session else None
         if folder != self._folder:
             self._folder = folder
-            self._context.clear_downloads()
+            self.server.downloads.clear()
         if snapshot.version != self._version or self.shell.needs_drawing:
-            with self.server.viser.atomic():
-                self.shell.draw(snapshot)
+            with self._context.lock, self.server.viser.atomic():
+                self.shell.update(snapshot)
             for notice in snapshot.notices:
                 if notice.number > self._notified:
                     self._notified = notice.number
                     self._context.notify(notice.level, notice.text)
         self._version = snapshot.version
-        if preview is not None and preview.number != self._number:
-            self.shell.draw_preview(preview)
+        if preview and preview.number != self._number:
+            with self._context.lock:
+                self.shell.draw_preview(preview)
             self._number = preview.number
 
     def _greet_client(self, client: viser.ClientHandle) -> None:
@@ -200,7 +200,7 @@ def print_links(server: SafeServer) -> None:
         )
     if server.certificate is None and not server.loopback:
         print("The connection is not encrypted: use --tls, or a network that you trust.")
-    elif server.certificate is not None and server.certificate.self_made:
+    elif server.certificate and server.certificate.self_made:
         print(
             "Browsers warn of the self-made certificate. Compare its SHA-256 fingerprint before you"
             " continue:"

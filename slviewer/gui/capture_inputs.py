@@ -5,7 +5,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from slviewer.gui.panel import NO_SESSION, PanelPart, Setting, StepPanel
+from slviewer.gui.panel import PanelPart, StepPanel
 from slviewer.gui.widgets import Html, Picture, Text, coloured, paragraph
 from slviewer.pipeline.suggest_exposure import BUDGET_S, STATES, ExposureSuggestion
 from slviewer.pipeline.turn import FULL_TURN_DEG, STEPS
@@ -13,7 +13,7 @@ from slviewer.registration.multiway import MOST_SCANS
 from slviewer.session.capture import Role
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel
 from slviewer.session.importers.layouts import Codec, layouts
-from slviewer.wizard.snapshot import ExposureChange, Snapshot
+from slviewer.wizard.snapshot import ExposureChange
 
 _MULTIPLES: dict[str, tuple[float, ...]] = {
     "1": (),
@@ -44,33 +44,31 @@ class ExposureInputs(PanelPart):
 
     def build(self) -> None:
         """Create the inputs."""
-        gui, context = self._gui, self._context
-        self._budget = gui.add_number(
-            "Time limit, s", BUDGET_S, min=0.5, max=600.0, step=0.5, hint="Of one capture",
-            visible=False,
-        )  # fmt: skip
-        self._suggest = context.button(
+        self._budget = self.number("Time limit, s", BUDGET_S, 0.5, 600.0, 0.5, "Of one capture")
+        self._budget.visible = False
+        self._suggest = self.button(
             "Suggest exposure", self._request, "sun",
             hint="Tries exposures for some seconds, and sets the best",
         )  # fmt: skip
-        self._undo = context.button("Undo exposure", self._operator.undo_exposure, "arrow-back-up")
-        self._picture = Picture(gui, "Measured before and now")
+        self._undo = self.button("Undo exposure", self._operator.undo_exposure, "arrow-back-up")
+        self._picture = Picture(self._gui, "Measured before and now")
         if self._for_scan:
             return
-        several = gui.add_dropdown(
+        several = self.dropdown(
             "Exposures",
             (*_MULTIPLES, _SUGGESTED),
-            hint="Several for shiny and dark parts: each pixel uses the best",
+            "Several for shiny and dark parts: each pixel uses the best",
         )
-        self._several = Setting(context, several, self._set_several)
-        self._note = Text(gui)
+        self._several = self.setting(several, self._set_several)
+        self._note = Text(self._gui)
 
-    def draw(self, snapshot: Snapshot) -> None:
+    def draw(self) -> None:
         """Show the exposures of the session, and what the last suggestion measures."""
-        session, rig, latest = snapshot.session, snapshot.rig, snapshot.exposure_change
+        snapshot = self.panel.snapshot
+        rig, latest = snapshot.rig, snapshot.exposure_change
         shown = rig.exposure_ms is not None and not rig.is_recorded
         self._suggest.visible, self._undo.visible = shown, shown and latest is not None
-        self._suggest.disabled = self._undo.disabled = not (rig.is_idle and session is not None)
+        self._suggest.disabled = self._undo.disabled = not (rig.is_idle and snapshot.session)
         if latest is not self._drawn:
             self._drawn = latest
             if latest is None:
@@ -82,7 +80,7 @@ class ExposureInputs(PanelPart):
         if self._for_scan:
             return
         self._budget.visible = self._several.handle.visible = shown
-        exposures = (session or NO_SESSION).exposures_ms
+        exposures = self.panel.session.exposures_ms
         self._several.update(name_exposures(exposures, rig.exposure_ms))
         each = ", ".join(f"{exposure:g}" for exposure in exposures)
         self._note.write(f"Exposures of each capture: {each} ms." if exposures else "", "dim")
@@ -151,21 +149,21 @@ class TurnInputs(PanelPart):
 
     def build(self) -> None:
         """Create the inputs."""
-        gui, context, operator = self._gui, self._context, self._operator
-        with gui.add_folder("Turntable") as self._folder:
-            self._steps: Any = gui.add_number(
-                "Steps", STEPS, min=2, max=MOST_SCANS, step=1, hint="Scans of a turn"
+        operator = self._operator
+        with self._gui.add_folder("Turntable") as self._folder:
+            self._steps = self.number("Steps", STEPS, 2, MOST_SCANS, 1, "Scans of a turn")
+            self._range = self.number(
+                "Range, °",
+                FULL_TURN_DEG,
+                -FULL_TURN_DEG,
+                FULL_TURN_DEG,
+                5.0,
+                "360 for a full turn; negative turns the other way",
             )
-            self._range: Any = gui.add_number(
-                "Range, °", FULL_TURN_DEG, min=-FULL_TURN_DEG, max=FULL_TURN_DEG, step=5.0,
-                hint="360 for a full turn; negative turns the other way",
-            )  # fmt: skip
-            merge = gui.add_checkbox(
-                "Merge and mesh",
-                True,
-                hint="At the end; the mesh is closed, also where the part stands",
+            merge = self.checkbox(
+                "Merge and mesh", "At the end; the mesh is closed, also where the part stands", True
             )
-            self._scan = context.button(
+            self._scan = self.button(
                 "Scan all round",
                 lambda: operator.scan_all_round(
                     int(self._steps.value), float(self._range.value), then_merge=merge.value
@@ -173,25 +171,24 @@ class TurnInputs(PanelPart):
                 "rotate-360",
                 None,
             )
-            self._resume = context.button(
+            self._resume = self.button(
                 "Resume turn",
                 lambda: operator.resume_turn(then_merge=merge.value),
                 "player-track-next",
                 hint="Captures the missing steps. Leave part and table as they are.",
             )
-            self._note = Text(gui)
+            self._note = Text(self._gui)
 
-    def draw(self, snapshot: Snapshot) -> None:
+    def draw(self) -> None:
         """Show the inputs where the rig has a turntable, and what the last turn lacks."""
-        self._folder.visible = bool(snapshot.rig.turntable)
-        ready = snapshot.rig.is_idle and snapshot.step("scan").state != "blocked"
-        self._scan.disabled = self._resume.disabled = not ready
-        scans = (snapshot.session or NO_SESSION).scans
-        turned = [(scan.created, scan.turn_step) for scan in scans if scan.turn_step is not None]
+        rig, scans = self.panel.snapshot.rig, self.panel.session.scans
+        self._folder.visible = bool(rig.turntable)
+        self._scan.disabled = self._resume.disabled = not rig.is_idle or self.panel.is_blocked
+        turned = [(scan.created, scan.turn_step) for scan in scans if scan.turn_step]
         last = max(turned, key=lambda each: each[0], default=("", None))[1]
         captured = sum(last is not None and step.turn == last.turn for _, step in turned)
         self._resume.visible = last is not None and captured < last.steps
-        if last is not None:
+        if last:
             self._resume.label = f"Resume {last.turn}"
         text = f"{last.turn}: {captured} of {last.steps} steps captured." if last else ""
         self._note.write(text if self._resume.visible else "", "warning")
@@ -201,41 +198,32 @@ class SimulatedObject(PanelPart):
     """Inputs that place and move an object in front of the simulated rig; hidden with real
     devices."""
 
-    _standing = _handled = ""
-    _T = np.eye(4)
-
     def __init__(self, panel: StepPanel, *things: str) -> None:
         self._things = things
         super().__init__(panel)
 
     def build(self) -> None:
         """Create the inputs."""
-        gui, context = self._gui, self._context
-        with gui.add_folder("Simulated rig") as self._folder:
-            self._note = Text(gui)
-            thing: Any = gui.add_dropdown("Object", (_OTHER, *self._things))
-            self._distance = gui.add_number(
-                "Depth, mm", 600.0, min=NEAREST_MM, max=FARTHEST_MM, step=5.0,
-                hint="From the camera",
-            )  # fmt: skip
-            self._turn = gui.add_number("Turn, °", 0.0, min=-90.0, max=90.0, step=5.0)
-            self._handles = gui.add_checkbox(
-                "3D handles", False, hint="To move and turn it in the 3D view"
+        with self._gui.add_folder("Simulated rig") as self._folder:
+            self._note = Text(self._gui)
+            thing = self.dropdown("Object", (_OTHER, *self._things))
+            self._distance = self.number(
+                "Depth, mm", 600.0, NEAREST_MM, FARTHEST_MM, 5.0, "From the camera"
             )
-        context.on_change(self._draw_handles, self._handles)
+            self._turn = self.number("Turn, °", 0.0, -90.0, 90.0, 5.0)
+            self._handles = self.checkbox("3D handles", "To move and turn it in the 3D view")
         self._settings = [
-            Setting(context, thing, self._request_choice),
-            Setting(context, self._distance, lambda mm: self._move(self._distance, distance_mm=mm)),
-            Setting(context, self._turn, lambda deg: self._move(self._turn, turn_deg=deg)),
+            self.setting(thing, self._request_choice),
+            self.setting(self._distance, lambda mm: self._move(self._distance, distance_mm=mm)),
+            self.setting(self._turn, lambda deg: self._move(self._turn, turn_deg=deg)),
         ]
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Show the object in view, its depth and turn."""
-        world = snapshot.world
+    def draw(self) -> None:
+        """Show the object in view, its depth and turn, and its 3D handles."""
+        world = self.panel.snapshot.world
         self._folder.visible = world is not None
         if world is None:
-            self._standing = ""
-            self._draw_handles()
+            self._layer.remove(_GIZMO)
             return
         fits = world.standing in self._things
         self._note.write(
@@ -243,30 +231,23 @@ class SimulatedObject(PanelPart):
             "warning",
         )
         self._distance.disabled = self._turn.disabled = not fits
-        self._standing, self._T = world.standing if fits else "", world.T_camera_object
-        self._draw_handles()
+        T = world.T_camera_object
+        if fits and self._handles.value:
+            self._layer.gizmo(_GIZMO, T, None, self._place)
+        else:
+            self._layer.remove(_GIZMO)
         values = (
             world.standing if fits else _OTHER,
-            round(float(np.clip(self._T[2, 3], NEAREST_MM, FARTHEST_MM)), 1),
+            round(float(np.clip(T[2, 3], NEAREST_MM, FARTHEST_MM)), 1),
             round(float(np.clip(world.turn_deg, -90, 90)), 1),
         )
         for setting, value in zip(self._settings, values, strict=True):
             setting.update(value)
 
-    def _draw_handles(self) -> None:
-        """Add, move or remove the 3D handles of the object in view."""
-        wanted = self._standing if self._handles.value else ""
-        if not wanted:
-            self._layer.remove(_GIZMO)
-        elif wanted != self._handled:
-            self._layer.gizmo(_GIZMO, self._T, None, self._request_place)
-        else:
-            self._layer.move(_GIZMO, self._T)
-        self._handled = wanted
-
-    def _request_place(self, T: np.ndarray) -> None:
-        """Request that the object be moved to T (4, 4) mm."""
-        self._context.callback(lambda: self._operator.place(self._standing, T))(None)  # type: ignore[arg-type]
+    def _place(self, T: np.ndarray) -> None:
+        """Request that the object in view be moved to T (4, 4) mm."""
+        if world := self.panel.snapshot.world:
+            self._operator.place(world.standing, T)
 
     def _request_choice(self, thing: Any) -> None:
         """Request that the chosen object be placed in view."""
@@ -289,16 +270,16 @@ class ImportInputs(PanelPart):
 
     def build(self) -> None:
         """Create the inputs."""
-        gui, context = self._gui, self._context
+        gui = self._gui
         with gui.add_folder("Import captures", expand_by_default=False):
             Text(gui).write(
                 f"Imports images of another program as {_RESULTS[self._role]}, one folder each.",
                 "dim",
             )
-            self._layout: Any = gui.add_dropdown(
+            self._layout = self.dropdown(
                 "Layout",
                 (_DETECT, *layouts()),
-                hint="How the files are named; detect uses the names, or a TOML",
+                "How the files are named; detect uses the names, or a TOML",
             )
             self._description = Text(gui)
             self._projector = gui.add_text(
@@ -308,42 +289,36 @@ class ImportInputs(PanelPart):
             self._channel = gui.add_dropdown(
                 "Channel", get_args(Channel), initial_value=DEFAULT_CHANNEL, hint="Of colour images"
             )
-            self._codec = gui.add_dropdown(
-                "Codec", (_AUTOMATIC, *get_args(Codec)), visible=False, hint="Of SLStudio"
-            )
+            self._codec = self.dropdown("Codec", (_AUTOMATIC, *get_args(Codec)), "Of SLStudio")
             self._prefix = gui.add_text(
                 "Prefix", "", hint="Put before the names: part gives part_pose_01"
             )
             folder = gui.add_text("Folder path", "", hint="On the computer that runs slviewer")
-            self._import = context.button(
+            self._import = self.button(
                 "Import folder",
                 lambda: self._operator.import_folder(folder.value, **self._collect_options()),
                 "folder-symlink",
                 None,
             )
-            self._upload = context.upload_button(
+            self._upload = self.upload_button(
                 "Upload zip",
                 lambda name, content: self._operator.import_zip(
                     name, content, **self._collect_options()
                 ),
                 ".zip",
             )
-        context.on_change(self._describe, self._layout)
-        self._describe()
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Enable the import while a session is open and no requested job runs."""
+    def draw(self) -> None:
+        """Enable the import while a session is open and no requested job runs; describe the chosen
+        layout, and show the inputs that it needs."""
+        snapshot, name = self.panel.snapshot, self._layout.value
         ready = snapshot.session is not None and not snapshot.is_busy
         self._import.disabled = self._upload.disabled = not ready
-
-    def _describe(self) -> None:
-        """Describe the chosen layout, and show the inputs that it needs."""
-        name = self._layout.value
         layout = layouts().get(name)
         self._description.write(f"Contains {layout.holds}." if layout else "", "dim")
         self._codec.visible = name == "slstudio"
         size = layout.projector if layout else None
-        if size is not None:
+        if size:
             empty = f"of the session, else {size[0]}x{size[1]}"
         elif name == "frames":
             empty = "of the TOML"

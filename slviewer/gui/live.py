@@ -3,13 +3,13 @@
 A browser that stalls gets nothing more until it has caught up, and delays no other.
 """
 
-import threading
+from functools import partial
 from typing import Any
 
 import numpy as np
 import viser
 
-from slviewer.gui.panel import PanelContext
+from slviewer.gui.panel import PanelContext, start_worker
 from slviewer.gui.scene import add_points, spacing, thin
 from slviewer.server.viewers import Viewers
 from slviewer.wizard.live_scan import LiveCloud
@@ -27,63 +27,44 @@ class LiveScreen:
         self._context = context
         context.scene.layer(LAYER)
         self._viewers = Viewers(context.server.viser, self._wake)
-        self._condition = threading.Condition()
+        self._pass_on = start_worker("slviewer live screen")
         self._cloud: LiveCloud | None = None
         self._nodes: dict[int, Any] = {}
         self._drawn: dict[int, int] = {}
         self._limit, self._counted = MOST_POINTS, 0
         self._is_in_view = False
-        self._thread: threading.Thread | None = None
         self.points = 0
         """Number of points drawn of the last cloud."""
 
     def offer(self, cloud: LiveCloud) -> None:
         """Set the cloud to draw next, in place of one that is still waiting."""
-        with self._condition:
-            self._cloud = cloud
-            if self._thread is None:
-                self._thread = threading.Thread(
-                    target=self._serve, name="slviewer live screen", daemon=True
-                )
-                self._thread.start()
-            self._condition.notify_all()
+        self._cloud = cloud
+        self._wake()
 
     def clear(self) -> None:
         """Remove the live cloud."""
-        with self._condition:
-            self._cloud, self._is_in_view = None, False
-            self._condition.notify_all()
+        self._cloud, self._is_in_view = None, False
+        self._wake()
 
     def _wake(self) -> None:
-        """Wake the drawing thread: a browser has drawn what it was sent."""
-        with self._condition:
-            self._condition.notify_all()
+        """Draw soon: there is another cloud, or a browser has drawn what it was sent."""
+        self._pass_on(partial(self._context.run, self._draw))
 
-    def _serve(self) -> None:
-        """Draw the latest cloud, or remove it, whenever it has changed or a browser is ready."""
-        while True:
-            with self._condition:
-                cloud = self._cloud
-            try:
-                drawn = self._draw_cloud(cloud) if cloud is not None else self._remove_cloud()
-            except Exception as error:
-                self._context.report_failure(error)
-                drawn = False
-            with self._condition:
-                if not drawn and self._cloud is cloud:
-                    # a browser that connects does not notify this thread
-                    self._condition.wait(None if cloud is None else 0.5)
-
-    def _draw_cloud(self, cloud: LiveCloud) -> bool:
-        """Send a cloud to the browsers that are ready for it; returns whether there was any."""
+    def _draw(self) -> None:
+        """Send the latest cloud to the browsers that are ready for it, or remove it from all."""
+        cloud = self._cloud
+        if cloud is None:
+            self._remove_cloud()
+            return
         clients = [c for c in self._viewers.ready() if self._drawn.get(c.client_id) != cloud.number]
         if not clients:
-            return False
+            return
         self._adapt_limit()
         points, colours = thin(cloud.points, cloud.texture, self._limit)
         self.points = len(points)
         if not len(points):
-            return self._remove_cloud()
+            self._remove_cloud()
+            return
         for client in clients:
             self._send_cloud(client, points, colours)
             self._drawn[client.client_id] = cloud.number
@@ -93,7 +74,6 @@ class LiveScreen:
         if cloud.number != self._counted:
             self._counted = cloud.number
             self._context.operator.count_live_shown(cloud)
-        return True
 
     def _send_cloud(
         self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray
@@ -109,12 +89,11 @@ class LiveScreen:
                 node.points, node.colors, node.point_size = points, colours, spacing(points)
             self._viewers.sent(client)
 
-    def _remove_cloud(self) -> bool:
-        """Remove the cloud from all browsers; returns False, as nothing was drawn."""
+    def _remove_cloud(self) -> None:
+        """Remove the cloud from all browsers."""
         nodes, self._nodes, self._drawn = self._nodes, {}, {}
         for node in nodes.values():
             node.remove()
-        return False
 
     def _adapt_limit(self) -> None:
         """Adapt the number of points to the slowest browser, and forget browsers that have

@@ -8,7 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.render import format_count
-from slviewer.gui.panel import PanelPart, Setting, StepPanel
+from slviewer.gui.panel import PanelPart, StepPanel
 from slviewer.gui.scene import Click
 from slviewer.gui.widgets import Text, note
 from slviewer.pipeline.edit import SUPPORT, Selection
@@ -21,7 +21,7 @@ from slviewer.surface.selection import (
     select_support,
 )
 from slviewer.wizard.result_views import ScanCloud
-from slviewer.wizard.snapshot import ScanView, SessionView
+from slviewer.wizard.snapshot import ScanView
 
 OFF, RECTANGLE, LASSO, PART = "off", "rectangle", "lasso", "connected part"
 _HINTS = {
@@ -69,51 +69,51 @@ class PointEditing(PanelPart):
     """Inputs that select, hide and delete points of the scans that are shown, drawn in a layer of
     the scene.
 
-    ``redraw()`` is called when other points are to be shown; ``pick`` gets clicks while nothing is
+    ``changed()`` is called when other points are to be shown; ``pick`` gets clicks while nothing is
     being selected.
     """
 
     def __init__(
         self,
         panel: StepPanel,
-        redraw: Callable[[], None],
+        changed: Callable[[], None],
         pick: Callable[[Click], None] | None = None,
     ) -> None:
-        super().__init__(panel)
-        self._redraw, self._pick = redraw, pick
+        self._changed, self._pick = changed, pick
         self._scans: list[_EditedScan] = []
         self._what: list[str] = []
-        self._corners: list[np.ndarray] = []
-        self._rays: list[np.ndarray] = []
-        self._view: ViewCamera | None = None
+        self._outline: list[Click] = []
         self._visible = False
-        gui, context, operator = self._gui, self._context, self._operator
+        super().__init__(panel)
+
+    def build(self) -> None:
+        """Create the inputs."""
+        gui, operator = self._gui, self._operator
         with gui.add_folder("Edit points", expand_by_default=False) as self._folder:
-            self._mode = gui.add_dropdown("Select by", (OFF, RECTANGLE, LASSO, PART))
+            self._mode = self.dropdown("Select by", _HINTS, do=self._change_mode)
             self._hint = Text(gui)
-            self._close = context.button("Close outline", self._close_outline, "polygon", None)
+            self._close = self.button("Close outline", self._close_outline, "polygon", None)
             self._close.visible = False
-            context.button(
+            self.button(
                 "Select support", self._select_support, "table",
                 hint="The plane that the object stands on, and all below it",
             )  # fmt: skip
-            context.button("Invert selection", self._invert, "switch-horizontal")
-            context.button("Select nothing", self._clear_selection, "x")
+            self.button("Invert selection", self._invert, "switch-horizontal")
+            self.button("Select nothing", self._clear_selection, "x")
             self._status = Text(gui)
-            self._hide = context.button("Hide selected", self._hide_selected, "eye-off")
-            self._show = context.button("Show hidden", self._show_hidden, "eye")
-            self._delete = context.button(
+            self._hide = self.button("Hide selected", self._hide_selected, "eye-off")
+            self._show = self.button("Show hidden", self._show_hidden, "eye")
+            self._delete = self.button(
                 "Delete selected", self._delete_selected, "eraser", "red",
                 hint="The scan on disk stays as it is: Undo brings the points back",
             )  # fmt: skip
-            self._undo = context.button(
+            self._undo = self.button(
                 "Undo edit", lambda: operator.undo_edit(*self._names), "arrow-back-up", "orange"
             )
-            self._redo = context.button(
+            self._redo = self.button(
                 "Redo edit", lambda: operator.redo_edit(*self._names), "arrow-forward-up"
             )
             self._list = Text(gui)
-        context.on_change(self._change_mode, self._mode)
         self._draw_status()
 
     @property
@@ -128,25 +128,24 @@ class PointEditing(PanelPart):
 
         What was selected or hidden stays for the same scans.
         """
-        with self._lock:
-            before = self._scans
-            self._scans = [
-                _EditedScan(cloud, points, *np.zeros((2, *points.shape[:2]), bool))
-                for cloud, points in scans
-            ]
-            old, new = (
-                [(scan.cloud.name, scan.points.shape) for scan in each]
-                for each in (before, self._scans)
-            )
-            if old == new:
-                for scan, earlier in zip(self._scans, before, strict=True):
-                    scan.hidden = earlier.hidden
-                    # no plane: others may lie below it now
-                    scan.selected = earlier.selected & scan.shown
-                self._draw_selection()
-            else:
-                self._clear_selection()
-            return [scan.shown_points for scan in self._scans]
+        before = self._scans
+        self._scans = [
+            _EditedScan(cloud, points, *np.zeros((2, *points.shape[:2]), bool))
+            for cloud, points in scans
+        ]
+        old, new = (
+            [(scan.cloud.name, scan.points.shape) for scan in each]
+            for each in (before, self._scans)
+        )
+        if old == new:
+            for scan, earlier in zip(self._scans, before, strict=True):
+                scan.hidden = earlier.hidden
+                # no plane: others may lie below it now
+                scan.selected = earlier.selected & scan.shown
+            self._draw_selection()
+        else:
+            self._clear_selection()
+        return [scan.shown_points for scan in self._scans]
 
     def offer(self, scans: Sequence[ScanView]) -> None:
         """List the edits of scans, and offer to undo and redo them; without scans nothing is
@@ -183,17 +182,16 @@ class PointEditing(PanelPart):
 
     def _clear_selection(self) -> None:
         """Select nothing, and forget the outline."""
-        with self._lock:
-            for scan in self._scans:
-                scan.selected = np.zeros_like(scan.selected)
-                scan.plane = None
-            self._what = []
-            self._forget_outline()
-            self._draw_selection()
+        for scan in self._scans:
+            scan.selected = np.zeros_like(scan.selected)
+            scan.plane = None
+        self._what = []
+        self._forget_outline()
+        self._draw_selection()
 
     def _forget_outline(self) -> None:
         """Forget the corners of the outline."""
-        self._corners, self._rays, self._view = [], [], None
+        self._outline = []
         self._layer.remove(_OUTLINE)
         self._hint.write(_HINTS[self._mode.value], "dim")
         self._close.visible = False
@@ -223,13 +221,12 @@ class PointEditing(PanelPart):
     # the 3D view
 
     def _change_mode(self) -> None:
-        """Take what the new way of selecting needs, then show its hint."""
+        """Take the clicks or drags that the way of selecting needs, then show its hint."""
         self._listen()
-        with self._lock:
-            self._forget_outline()
+        self._forget_outline()
 
     def _listen(self) -> None:
-        """Take the clicks or drags that the way of selecting needs."""
+        """Take the clicks or drags that the way of selecting needs, else leave them."""
         mode = self._mode.value if self._visible else ""
         self._scene.on_rectangle(self._take_rectangle if mode == RECTANGLE else None)
         clicks = {OFF: self._pick, LASSO: self._take_corner, PART: self._select_part}
@@ -237,14 +234,13 @@ class PointEditing(PanelPart):
 
     def _select_part(self, click: Click) -> None:
         """Select the part that a click meets."""
-        with self._lock:
-            clouds = [scan.shown_points for scan in self._scans]
-            met = click.find_first(clouds)
-            if met is not None:
-                i, (v, u) = met
-                masks = [np.zeros_like(scan.selected) for scan in self._scans]
-                masks[i] = select_connected(clouds[i], (u, v))
-                self._add(masks, PART)
+        clouds = [scan.shown_points for scan in self._scans]
+        met = click.find_first(clouds)
+        if met:
+            i, (v, u) = met
+            masks = [np.zeros_like(scan.selected) for scan in self._scans]
+            masks[i] = select_connected(clouds[i], (u, v))
+            self._add(masks, PART)
 
     def _select_outline(self, view: ViewCamera, corners: np.ndarray, what: str) -> None:
         """Select what an outline (n, 2) holds in a view."""
@@ -252,42 +248,37 @@ class PointEditing(PanelPart):
 
     def _take_rectangle(self, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> None:
         """Select what a rectangle, from its lowest to its highest corner (2,), holds in a view."""
-        with self._lock:
-            self._select_outline(
-                view, np.array([low, [high[0], low[1]], high, [low[0], high[1]]]), RECTANGLE
-            )
+        self._select_outline(
+            view, np.array([low, [high[0], low[1]], high, [low[0], high[1]]]), RECTANGLE
+        )
 
     def _take_corner(self, click: Click) -> None:
         """Add a corner of the outline; begin again where the view has moved."""
-        view, ray = click.view, click.direction
-        with self._lock:
-            if self._view is not None and not self._view.is_near(view):
-                self._forget_outline()
-                self._context.notify("info", "The view has moved: the outline begins again")
-            if not self._scans:
-                return
-            self._view = view
-            self._corners.append(click.place)
-            # drawn before the points, so that it stays visible
-            away = 0.5 * min(
-                float(np.nanmin(np.linalg.norm(s.points - view.position, axis=-1)))
-                for s in self._scans
-            )
-            self._rays.append(view.position + away * ray / np.linalg.norm(ray))
-            ends = np.array(self._rays)
-            segments = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
-            self._layer.lines(_OUTLINE, segments, SELECTED)
-            count = format_count(len(self._corners), "corner")
-            self._hint.write(f"{_HINTS[LASSO]} {count} set.", "dim")
-            self._close.visible, self._close.disabled = True, len(self._corners) < 3
+        if self._outline and not self._outline[-1].view.is_near(click.view):
+            self._forget_outline()
+            self.context.notify("info", "The view has moved: the outline begins again")
+        if not self._scans:
+            return
+        self._outline.append(click)
+        # drawn before the points, so that it stays visible
+        position, rays = click.view.position, np.array([each.direction for each in self._outline])
+        away = 0.5 * min(
+            float(np.nanmin(np.linalg.norm(scan.points - position, axis=-1)))
+            for scan in self._scans
+        )
+        ends = position + away * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        segments = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
+        self._layer.lines(_OUTLINE, segments, SELECTED)
+        count = format_count(len(rays), "corner")
+        self._hint.write(f"{_HINTS[LASSO]} {count} set.", "dim")
+        self._close.visible, self._close.disabled = True, len(rays) < 3
 
     def _close_outline(self) -> None:
         """Select what the outline holds."""
-        with self._lock:
-            if self._scans and self._view is not None:
-                view, corners = self._view, np.array(self._corners)
-                self._forget_outline()
-                self._select_outline(view, corners, LASSO)
+        if self._scans and self._outline:
+            view, corners = self._outline[-1].view, np.array([c.place for c in self._outline])
+            self._forget_outline()
+            self._select_outline(view, corners, LASSO)
 
     # the buttons
 
@@ -299,91 +290,82 @@ class PointEditing(PanelPart):
 
     def _select_support(self) -> None:
         """Select the plane that the object stands on, and all below it, in each scan."""
-        with self._lock:
-            supports = []
-            for scan in self._require_scans():
-                visible = np.where(scan.shown[..., None], scan.cloud.points, np.float32(np.nan))
-                supports.append(select_support(visible, scan.cloud.sigma_z))
-            self._add([mask for _, mask in supports], SUPPORT, [plane for plane, _ in supports])
+        supports = []
+        for scan in self._require_scans():
+            visible = np.where(scan.shown[..., None], scan.cloud.points, np.float32(np.nan))
+            supports.append(select_support(visible, scan.cloud.sigma_z))
+        self._add([mask for _, mask in supports], SUPPORT, [plane for plane, _ in supports])
 
     def _invert(self) -> None:
         """Select what was not selected, of the points that are shown."""
-        with self._lock:
-            for scan in self._require_scans():
-                scan.selected, scan.plane = scan.shown & ~scan.selected, None
-            self._what = [f"all but {' and '.join(self._what)}"] if self._what else ["everything"]
-            self._draw_selection()
+        for scan in self._require_scans():
+            scan.selected, scan.plane = scan.shown & ~scan.selected, None
+        self._what = [f"all but {' and '.join(self._what)}"] if self._what else ["everything"]
+        self._draw_selection()
 
     def _hide_selected(self) -> None:
         """Hide the selected points in this view; they are still used."""
-        with self._lock:
-            for scan in self._scans:
-                scan.hidden = scan.hidden | scan.selected
-            self._clear_selection()
-        self._redraw()
+        for scan in self._scans:
+            scan.hidden = scan.hidden | scan.selected
+        self._clear_selection()
+        self._changed()
 
     def _show_hidden(self) -> None:
         """Show the hidden points again."""
-        with self._lock:
-            for scan in self._scans:
-                scan.hidden = np.zeros_like(scan.hidden)
-            self._draw_selection()
-        self._redraw()
+        for scan in self._scans:
+            scan.hidden = np.zeros_like(scan.hidden)
+        self._draw_selection()
+        self._changed()
 
     def _delete_selected(self) -> None:
         """Request that the selected points be deleted."""
-        with self._lock:
-            selections = [
-                Selection(scan.cloud.name, scan.cloud.points, scan.selected, scan.plane)
-                for scan in self._require_scans()
-            ]
-            if not any(each.selected.any() for each in selections):
-                raise InputError("no point is selected: select some first")
-            if self._operator.delete_points(selections, " and ".join(self._what)):
-                self._clear_selection()
+        selections = [
+            Selection(scan.cloud.name, scan.cloud.points, scan.selected, scan.plane)
+            for scan in self._require_scans()
+        ]
+        if not any(each.selected.any() for each in selections):
+            raise InputError("no point is selected: select some first")
+        if self._operator.delete_points(selections, " and ".join(self._what)):
+            self._clear_selection()
 
 
 class RegionInputs(PanelPart):
     """Inputs that show and set the session's region of interest, drawn in a layer of the scene."""
 
     _region: RegionOfInterest | None = None
-    _is_on = False
     _scan = ""
     _drawn: object = None
 
     def build(self) -> None:
         """Create the inputs."""
-        gui, context = self._gui, self._context
+        gui = self._gui
         with gui.add_folder("Region of interest", expand_by_default=False):
             self._text = Text(gui)
-            use = gui.add_checkbox(
-                "Use region", False, hint="Ignores all points outside of a box, in every scan"
+            self._on = self.setting(
+                self.checkbox("Use region", "Ignores all points outside of a box, in every scan"),
+                self._switch,
             )
-            self._automatic = context.button(
+            self._automatic = self.button(
                 "Automatic region",
                 lambda: self._operator.fit_region(self._scan),
                 "box",
                 hint="Box around this scan",
             )
-            self._handles = gui.add_checkbox(
-                "Handles", False, hint="Arrows move the box in 3D, rings turn it"
-            )
+            self._handles = self.checkbox("Handles", "Arrows move the box in 3D, rings turn it")
             self._centre = gui.add_vector3("Centre (mm)", (0.0, 0.0, 0.0), step=0.1)
             self._size = gui.add_vector3(
                 "Size (mm)", (1.0, 1.0, 1.0), min=(0.1, 0.1, 0.1), step=0.1
             )
             self._turn = gui.add_vector3("Turn (°)", (0.0, 0.0, 0.0), step=0.1)
-        self._on = Setting(context, use, self._switch)
         self._numbers = [
-            Setting(context, each, self._set_from_numbers)
+            self.setting(each, self._set_from_numbers)
             for each in (self._centre, self._size, self._turn)
         ]
-        context.on_change(self._draw_box, self._handles)
 
-    def offer(self, session: SessionView, scan: str) -> None:
-        """Show the region of a session; ``scan``: the one that the automatic region is put
+    def offer(self, scan: str) -> None:
+        """Show the region of the session; ``scan``: the one that the automatic region is put
         around."""
-        self._scan = scan
+        session, self._scan = self.panel.session, scan
         self._region = region = session.region
         self._on.update(session.region_is_on)
         for handle in (self._handles, self._centre, self._size, self._turn):
@@ -399,16 +381,13 @@ class RegionInputs(PanelPart):
                 number.update(tuple(round(each, 1) for each in value))
             is_off = "" if session.region_is_on else "The region is off: all points are used."
             self._text.write(is_off, "dim")
-        self._is_on = session.region_is_on
-        self._draw_box()
+        drawn = (region, session.region_is_on, self._handles.value)
+        if drawn != self._drawn:
+            self._drawn = drawn
+            self._draw_box(region, session.region_is_on)
 
-    def _draw_box(self) -> None:
+    def _draw_box(self, region: RegionOfInterest | None, is_on: bool) -> None:
         """Draw the box, and its handle where it is wanted."""
-        region, is_on = self._region, self._is_on
-        drawn = (region, is_on, self._handles.value)
-        if drawn == self._drawn:
-            return
-        self._drawn = drawn
         if region is None or not self._handles.value:
             self._layer.remove(_HANDLE)
         if region is None:
@@ -423,17 +402,14 @@ class RegionInputs(PanelPart):
 
     def _preview(self, T: np.ndarray) -> None:
         """Draw the box at T (4, 4) while its handle is dragged."""
-        if self._region is not None:
+        if self._region:
             moved = RegionOfInterest.placed(T, self._region.size_mm)
             self._layer.lines(_BOX, moved.edges(), REGION_ON)
 
     def _place(self, T: np.ndarray) -> None:
         """Request the region at T (4, 4), where its handle was dragged to."""
-        region = self._region
-        if region is not None:
-            self._context.callback(
-                lambda: self._operator.set_region(RegionOfInterest.placed(T, region.size_mm))
-            )(None)
+        if self._region:
+            self._operator.set_region(RegionOfInterest.placed(T, self._region.size_mm))
 
     def _switch(self, on: bool) -> None:
         """Switch the region on or off; without one, take the automatic one."""

@@ -7,6 +7,7 @@ Every method may be called from any thread.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,8 +63,10 @@ class Click:
 class SceneLayer:
     """Draws objects into one layer of viser's scene; an object replaces that of the same name."""
 
-    def __init__(self, api: viser.SceneApi, name: str) -> None:
-        self.name, self._api = name, api
+    def __init__(
+        self, api: viser.SceneApi, name: str, submit: Callable[[Callable[[], Any]], None]
+    ) -> None:
+        self.name, self._api, self._submit = name, api, submit
         self._root: Any = api.add_frame(f"/{name}", show_axes=False)
         self._nodes: dict[str, Any] = {}
 
@@ -74,7 +77,7 @@ class SceneLayer:
     def remove(self, *names: str) -> None:
         """Remove those of these objects that exist."""
         for name in names:
-            if (node := self._nodes.pop(name, None)) is not None:
+            if node := self._nodes.pop(name, None):
                 node.remove()
 
     def clear(self) -> None:
@@ -149,8 +152,12 @@ class SceneLayer:
         *,
         scale_mm: float = 90.0,
     ) -> None:
-        """Add a handle to move and turn an object; both callbacks get T (4, 4) in the camera's
-        frame."""
+        """Add a handle to move and turn an object, or move the one that is there; both callbacks
+        get T (4, 4) in the camera's frame, `on_end` after what was submitted before."""
+        if name in self._nodes:
+            self._nodes[name].scale = scale_mm
+            self.move(name, T)
+            return
         wxyz, position = _split_pose(T)
         limits = ((-5000.0, 5000.0),) * 3
         self._nodes[name] = handle = self._api.add_transform_controls(
@@ -170,11 +177,11 @@ class SceneLayer:
             if on_move is not None:
                 on_move(T)
             if event.phase == "end":
-                on_end(T)
+                self._submit(partial(on_end, T))
 
     def move(self, name: str, T: np.ndarray) -> None:
         """Move an existing object to T (4, 4), without calling its callbacks."""
-        if (node := self._nodes.get(name)) is not None:
+        if node := self._nodes.get(name):
             node.wxyz, node.position = _split_pose(T)
 
     def cloud(
@@ -255,10 +262,11 @@ class SceneLayer:
 
 
 class ViewerScene:
-    """Viser's scene: its floor, its layers, and the clicks and drags into it."""
+    """Viser's scene: its floor, its layers, and the clicks and drags into it, which are passed on
+    by `submit(do)`."""
 
-    def __init__(self, api: viser.SceneApi) -> None:
-        self._api = api
+    def __init__(self, api: viser.SceneApi, submit: Callable[[Callable[[], Any]], None]) -> None:
+        self._api, self._submit = api, submit
         api.set_up_direction("-y")
         api.add_grid(
             "/floor",
@@ -275,21 +283,22 @@ class ViewerScene:
 
     def layer(self, name: str) -> SceneLayer:
         """Return a new layer."""
-        return SceneLayer(self._api, name)
+        return SceneLayer(self._api, name, self._submit)
 
     def on_click(self, do: Callable[[Click], None] | None) -> None:
         """Call `do(click)` for each click into the scene; None: stop."""
         self._api.remove_click_callback()
         if do is not None:
 
-            def click(event: Any) -> None:
+            def handle(event: Any) -> None:
                 """Call `do` with the place and ray of a click."""
                 place, origin, direction = map(
                     np.array, (event.screen_pos, event.ray_origin, event.ray_direction)
                 )
-                do(Click(read_view(event.client), place, origin, direction))
+                click = Click(read_view(event.client), place, origin, direction)
+                self._submit(partial(do, click))
 
-            self._api.on_click()(click)
+            self._api.on_click()(handle)
 
     def on_rectangle(self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None) -> None:
         """Call `do(view, low, high)` for each rectangle that is dragged: the browser's view, and
@@ -300,7 +309,8 @@ class ViewerScene:
 
             def select(event: Any) -> None:
                 """Call `do` with the corners of a rectangle."""
-                do(read_view(event.client), np.array(event.screen_min), np.array(event.screen_max))
+                low, high = np.array(event.screen_min), np.array(event.screen_max)
+                self._submit(partial(do, read_view(event.client), low, high))
 
             self._api.on_rect_select()(select)
 
@@ -344,20 +354,17 @@ def thin(
     skipped, grey levels become colours.
     """
     valid = np.asarray(np.isfinite(points).all(axis=-1))
-    excess = np.count_nonzero(valid) / limit
-    rows = columns = 1
-    while rows * columns < excess:
-        rows, columns = (rows, columns + 1) if rows == columns else (columns, columns)
+    excess = max(np.count_nonzero(valid) / limit, 1.0)
+    columns = int(np.ceil(np.sqrt(excess)))
+    rows = int(np.ceil(excess / columns))
     steps = (rows, columns) if points.ndim == 3 else (rows * columns,)
     part = tuple(slice(None, None, step) for step in steps)
     valid = valid[part]
     if isinstance(colours, np.ndarray) and colours.shape[: len(steps)] == points.shape[:-1]:
         colours = colours[part][valid]
-        colours = (
-            np.repeat(colours[:, None], 3, axis=1)
-            if colours.ndim == 1
-            else np.ascontiguousarray(colours)
-        )
+        if colours.ndim == 1:
+            colours = np.repeat(colours[:, None], 3, axis=1)
+        colours = np.ascontiguousarray(colours)
     return np.asarray(points[part][valid], np.float32), colours
 
 

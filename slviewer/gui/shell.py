@@ -17,7 +17,7 @@ import viser
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.evaluation.render import format_count
-from slviewer.gui.panel import NO_SESSION, PanelContext, StepPanel
+from slviewer.gui.panel import NO_SESSION, PanelContext, StepPanel, View
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.widgets import (
     NOTICES,
@@ -70,11 +70,11 @@ _MOST_NOTICES = 12  # of the latest, in the panel
 _MOST_FAULTS = 3  # of the session's files, in the panel
 
 
-class Shell:
-    """The page: builds it once; `draw` and `draw_preview` update it, from one thread."""
+class Shell(View):
+    """The page: builds it once; `update` and `draw_preview` update it, from one thread."""
 
     def __init__(self, context: PanelContext, steps: Sequence[StepView]) -> None:
-        self._gui, self._context = context.gui, context
+        super().__init__(context)
         self._devices = context.scene.layer("devices")
         self._drawn_devices: tuple[CalibrationView | None, tuple[int, int] | None] = (None, None)
         self._panels: dict[str, StepPanel] = {}
@@ -94,17 +94,17 @@ class Shell:
 
     def _build_left(self, steps: Sequence[StepView]) -> None:
         """Build the left panel: buttons of the steps, autopilot, session and messages."""
-        gui, context = self._gui, self._context
+        gui, operator = self._gui, self._operator
         gui.main_panel.dock_left()
         gui.main_panel.set_width(STEPS_PX)
         self._step_buttons = {
-            step.key: context.button(
+            step.key: self.button(
                 f"{number}. {step.title}", partial(self.go, step.key), _ICONS[step.state]
             )
             for number, step in enumerate(steps, 1)
         }
         gui.add_divider()
-        self._autopilot = context.button(
+        self._autopilot = self.button(
             "Autopilot", self._toggle_autopilot, "player-play", "teal", at_once=True
         )
         self._autopilot.visible = False
@@ -114,18 +114,14 @@ class Shell:
             self._path = gui.add_text(
                 "Folder", "", hint="Of another session; created if it does not exist"
             )
-            context.button(
-                "Open session",
-                lambda: context.operator.open_session(self._path.value),
-                "folder-open",
+            self.button(
+                "Open session", lambda: operator.open_session(self._path.value), "folder-open"
             )
         links = gui.add_button(
             "Links", icon=viser.Icon.LINK, color="gray", hint="For watching and for the projector"
         )
         links.on_click(
-            lambda event: context.callback(
-                partial(show_links, context, event.client), at_once=True
-            )(event)
+            lambda event: self.context.run(partial(show_links, self.context, event.client))
         )
         with gui.add_folder("Messages", expand_by_default=True):
             self._busy = Text(gui)
@@ -133,7 +129,7 @@ class Shell:
 
     def _build_right(self, steps: Sequence[StepView]) -> None:
         """Build the right panel: heading, problems, progress, and the panels of all steps."""
-        gui, context = self._gui, self._context
+        gui = self._gui
         panel = gui.add_panel()
         panel.dock_right()
         panel.set_width(STEP_PX)
@@ -141,20 +137,20 @@ class Shell:
             Text(gui).set(_SCROLL_BAR_MARGIN)
             self._heading = Text(gui)
             self._progress = Text(gui)
-            self._cancel = context.button(
-                "Cancel", context.operator.cancel, "player-stop", "red", at_once=True
+            self._cancel = self.button(
+                "Cancel", self._operator.cancel, "player-stop", "red", at_once=True
             )
-            self._next = context.button(
+            self._next = self.button(
                 "Continue", lambda: self.go(self._following_key), "arrow-right", "green"
             )
             self._cancel.visible = self._next.visible = False
             for key in (step.key for step in steps):
                 module = importlib.import_module(f"slviewer.gui.steps.{key}")
-                self._panels[key] = getattr(module, f"{key.title()}Panel")(context)
+                self._panels[key] = getattr(module, f"{key.title()}Panel")(self.context)
 
     # drawing
 
-    def draw(self, snapshot: Snapshot) -> None:
+    def update(self, snapshot: Snapshot) -> None:
         """Update the page from a snapshot."""
         self._follow_autopilot(snapshot)
         key = self.current
@@ -196,7 +192,7 @@ class Shell:
         self._shown_key = key
         self._panels[key].show(True)
         if key in _STEPS_WITH_RIG:
-            self._context.viewpoints.overview()
+            self.context.viewpoints.overview()
         else:
             self._panels[key].show_view()
 
@@ -224,7 +220,7 @@ class Shell:
             + "".join(alert(problem, "error") for problem in problems)
         )
         following = steps[at + 1] if at + 1 < len(steps) else None
-        if following is not None:
+        if following:
             self._following_key = following.key
             self._next.label = f"Continue to {following.title}"
         self._next.visible = bool(
@@ -263,7 +259,7 @@ class Shell:
                 f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}</span>',
                 ", ".join(counts),
             ]
-            if space is not None:
+            if space:
                 text = f"{format_bytes(space.free_bytes)} free"
                 if space.capture_bytes:
                     text += f"; a capture needs {format_bytes(space.capture_bytes)}"
@@ -297,10 +293,10 @@ class Shell:
         self._drawn_devices = (calibration, camera)
         self._devices.clear()
         rig = calibration.stereo.rig if calibration else None
-        if camera is not None:
+        if camera:
             K = (rig.camera if rig else nominal_lens(camera)).K
             self._devices.device("camera", K, camera, np.eye(4), CAMERA)
-        if projector is not None and rig is not None:
+        if projector and rig is not None:
             T_camera_projector = np.eye(4)  # the inverse of X_p = R X_c + t
             T_camera_projector[:3, :3], T_camera_projector[:3, 3] = rig.R.T, -rig.R.T @ rig.t
             self._devices.device(
@@ -311,11 +307,10 @@ class Shell:
 
     def _toggle_autopilot(self) -> None:
         """Start the autopilot, or stop it where it runs."""
-        operator = self._context.operator
-        if operator.snapshot().autopilot:
-            operator.cancel()
+        if self._operator.snapshot().autopilot:
+            self._operator.cancel()
         else:
-            operator.start_autopilot(Autopilot(operator, pause_s=0.5))
+            self._operator.start_autopilot(Autopilot(self._operator, pause_s=0.5))
 
 
 def autopilot_step(snapshot: Snapshot) -> str:
@@ -349,13 +344,13 @@ def _object_step(session: SessionView) -> str:
 def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
     """List (description, share done) of the running capture and of the requested job."""
     job, capture, work = snapshot.job, snapshot.rig.capture, []
-    if capture is not None:
+    if capture:
         waiting = f", {capture.waiting} waiting" if capture.waiting else ""
         text = f"Capturing {capture.name}: frame {capture.frame} of {capture.frames}{waiting}"
         if capture.stage:
             text = f"{capture.name}: {capture.stage}{waiting}"
         work.append((text, capture.frame / max(capture.frames, 1)))
-    if job is not None and not job.background:
+    if job and not job.background:
         waiting = f", {job.waiting} waiting" if job.waiting else ""
         stage = job.stage or "starting"
         work.append((f"{job.name}: {stage}{waiting} ({job.seconds:.0f} s)", job.share))

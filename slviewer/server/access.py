@@ -12,10 +12,10 @@ import ipaddress
 import re
 import secrets
 import socket
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
+from time import monotonic
 from types import MappingProxyType
 from typing import Literal, get_args
 
@@ -118,7 +118,7 @@ class Access:
     `tokens` by role are fixed ones; the others are random. `names` are further host names, `name`
     or `name:port`, under which this server is reached (behind a proxy, say); the address that a
     connection came in at is always one, and so is the machine's own name unless it serves itself
-    alone. `tls`: the server itself encrypts. `clock` returns seconds that never run backwards.
+    alone. `tls`: the server itself encrypts.
     """
 
     def __init__(
@@ -127,10 +127,8 @@ class Access:
         tokens: Mapping[Role, str] = MappingProxyType({}),
         names: tuple[str, ...] = (),
         tls: bool = False,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.port = port
-        self._clock = clock
         self.tls = tls
         self.names = frozenset(name.lower() for name in names)
         given = list(tokens.values())
@@ -158,12 +156,12 @@ class Access:
     def issue_one_time_token(self) -> str:
         """Return a token that the operator's browser can exchange once, within ONE_TIME_SECONDS."""
         token = secrets.token_urlsafe(24)
-        self._one_time[token] = self._clock() + ONE_TIME_SECONDS
+        self._one_time[token] = monotonic() + ONE_TIME_SECONDS
         return token
 
     def is_pending(self, token: str) -> bool:
         """Whether a one-time token has not been exchanged yet."""
-        return self._clock() < self._one_time.get(token, 0.0)
+        return monotonic() < self._one_time.get(token, 0.0)
 
     def exchange(self, token: str, address: str) -> Grant:
         """Return what a token opens; raises Refusal for a wrong one, and for an address that sent
@@ -172,7 +170,7 @@ class Access:
         An address with too many wrong tokens is still granted random ones, which cannot be guessed:
         else whoever shares the operator's address could keep the operator out.
         """
-        now = self._clock()
+        now = monotonic()
         recent = [t for t in self._wrong.get(address, []) if now - t < WRONG_TOKENS_SECONDS]
         limited = len(recent) >= WRONG_TOKENS
         if (expiry := self._one_time.pop(token, None)) is not None and now < expiry:

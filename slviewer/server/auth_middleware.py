@@ -1,5 +1,7 @@
-"""Authentication and routing of every HTTP request."""
+"""Authentication and routing of every HTTP request, and the headers that every answer carries."""
 
+import base64
+import hashlib
 import json
 import logging
 import re
@@ -9,6 +11,7 @@ from http import HTTPStatus
 from importlib import resources
 
 from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from slviewer.server.access import Access, Grant, Refusal, Role
@@ -17,14 +20,6 @@ from slviewer.server.downloads import PREFIX, Downloads
 from slviewer.server.help_pages import PREFIX as HELP_PREFIX
 from slviewer.server.help_pages import HelpPages
 from slviewer.server.limits import Admissions, address_group
-from slviewer.server.responses import (
-    HELP_POLICY,
-    harden,
-    page_policy,
-    respond,
-    script_hash,
-    viser_policy,
-)
 from slviewer.server.viser_internals import PAGE_SCRIPT, SUBPROTOCOL, VISER_SCRIPTS, client_page
 
 logger = logging.getLogger("slviewer.server")
@@ -36,8 +31,10 @@ hold for it too."""
 DEVICE_PATHS: dict[str, Role] = {"projector": "project", "camera": "camera"}
 """Below the operator's path: they lead to the page of a device with the rights of that page
 alone."""
-_SCRIPTS = (*VISER_SCRIPTS, script_hash(PAGE_SCRIPT))
-"""Hashes of the scripts that viser's page may run."""
+_CLOSED = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+HELP_POLICY = f"{_CLOSED}; style-src 'unsafe-inline'; img-src 'self'"
+"""Content-Security-Policy of the documentation: nothing runs there, and only this server's pictures
+are shown."""
 _PATH = re.compile(r"/|(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+/?")
 
 
@@ -117,7 +114,7 @@ class AuthMiddleware:
             html = self.device_pages[grant.role].html
             return _respond_page(html, page_policy(html, host))
         if not rest:
-            return _respond_page(self._viser_page, viser_policy(_SCRIPTS, host))
+            return _respond_page(self._viser_page, viser_policy(host))
         if rest.startswith(PREFIX):
             return await self._download(connection, rest)
         if rest.startswith(HELP_PREFIX):
@@ -206,3 +203,66 @@ class AuthMiddleware:
 def _respond_page(html: bytes, policy: str, status: HTTPStatus = HTTPStatus.OK) -> Response:
     """Respond with a page under this Content-Security-Policy."""
     return respond(status, html, "text/html; charset=utf-8", policy)
+
+
+def respond(
+    status: HTTPStatus,
+    body: bytes | str = b"",
+    content_type: str = "text/plain; charset=utf-8",
+    policy: str = _CLOSED,
+) -> Response:
+    """A complete answer with its length, hardened."""
+    data = body.encode() if isinstance(body, str) else body
+    headers = Headers({"Content-Type": content_type, "Content-Length": str(len(data))})
+    harden(headers, policy)
+    return Response(status.value, status.phrase, headers, data)
+
+
+def harden(headers: Headers, policy: str = _CLOSED) -> None:
+    """Add the headers that keep an answer out of other sites' pages, caches and histories (in
+    place)."""
+    for name, value in {
+        "Content-Security-Policy": policy,
+        "X-Content-Type-Options": "nosniff",
+        "X-Frame-Options": "DENY",
+        "Referrer-Policy": "no-referrer",
+        "Cross-Origin-Opener-Policy": "same-origin",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Cache-Control": "no-store",
+    }.items():
+        headers[name] = value
+
+
+def page_policy(html: bytes, host: str) -> str:
+    """Content-Security-Policy of our own pages: inline scripts, images and connections to this
+    server only."""
+    scripts = (
+        " ".join(script_hash(m) for m in re.findall(rb"<script[^>]*>(.*?)</script>", html, re.S))
+        or "'none'"
+    )
+    return (
+        f"{_CLOSED}; script-src {scripts}; style-src 'unsafe-inline'; img-src 'self' data: blob:; "
+        f"media-src data:; connect-src 'self' ws://{host} wss://{host}"
+    )
+
+
+def viser_policy(host: str) -> str:
+    """Return the content security policy of viser's page, which unpacks itself with WebAssembly in
+    a blob worker.
+
+    Only viser's own scripts and ours for it (given by their hashes) run, so that HTML in a label, a
+    script or an event handler in it, does nothing even where someone forgot to escape it. They may
+    evaluate text: parts of them are compiled so, and Plotly is sent as text.
+    """
+    scripts = " ".join((*VISER_SCRIPTS, script_hash(PAGE_SCRIPT)))
+    return (
+        f"{_CLOSED}; script-src {scripts} 'unsafe-eval'; "
+        "style-src 'unsafe-inline'; "
+        "img-src 'self' data: blob:; media-src data: blob:; font-src data:; worker-src blob:; "
+        f"connect-src 'self' data: blob: ws://{host} wss://{host}"
+    )
+
+
+def script_hash(script: bytes) -> str:
+    """A script's SHA hash as a source in a Content-Security-Policy."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}'"

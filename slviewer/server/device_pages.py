@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from functools import partial
 from importlib import resources
 from typing import Any
 
@@ -26,28 +27,18 @@ _SHARED = "device_page.js"
 def serve_device_pages(server: SafeServer, channels: PageChannels) -> None:
     """Serve the pages at `server.link("project")` and `server.link("camera")`, and connect them to
     `channels`."""
-    _serve_page(server, "project", "projector.html", channels.projector)
-    _serve_page(server, "camera", "camera.html", channels.camera)
+    folder = resources.files("slviewer.server")
+    script = folder.joinpath(_SHARED).read_text("utf-8")
+    pages: dict[Role, tuple[str, PageChannel[Any]]] = {
+        "project": ("projector.html", channels.projector),
+        "camera": ("camera.html", channels.camera),
+    }
+    for role, (name, channel) in pages.items():
+        html = folder.joinpath(name).read_text("utf-8").replace(f"/* {_SHARED} */", script)
+        server.device_pages[role] = DevicePage(html.encode(), partial(_talk, channel))
 
 
-def _serve_page(server: SafeServer, role: Role, name: str, channel: PageChannel[Any]) -> None:
-    """Serve the page of one role."""
-
-    async def handle(connection: ServerConnection) -> None:
-        """Exchange messages with a page until it disconnects."""
-        with contextlib.suppress(ConnectionClosed):
-            await _talk(connection, channel)
-
-    html, script = (
-        resources.files("slviewer.server").joinpath(file).read_text("utf-8")
-        for file in (name, _SHARED)
-    )
-    server.device_pages[role] = DevicePage(
-        html.replace(f"/* {_SHARED} */", script).encode(), handle
-    )
-
-
-async def _talk(connection: ServerConnection, channel: PageChannel[Any]) -> None:
+async def _talk(channel: PageChannel[Any], connection: ServerConnection) -> None:
     """Exchange messages between a page and its channel until one side ends the connection."""
     loop, outbox = asyncio.get_running_loop(), asyncio.Queue[bytes | None]()
 

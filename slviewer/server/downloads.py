@@ -34,31 +34,33 @@ class Downloads:
 
     def __init__(self) -> None:
         self._offers: dict[str, Offer] = {}
+        self._addresses: dict[Path, str] = {}
 
-    def offer(self, path: Path, *, within: Path, name: str | None = None) -> str:
-        """The address, relative to the wizard's page, at which this file is fetched until `clear`.
+    def offer(self, path: Path, *, within: Path) -> str:
+        """The address, relative to the wizard's page, at which this file is fetched until `clear`:
+        always the same.
 
         `within` is the folder that it belongs to (the session's); InputError where the file is
         missing or, through links or "..", is elsewhere. It is read when it is fetched, so that the
         newest content arrives.
         """
-        offer = Offer(
-            Path(path), Path(within).resolve(), safe_file_name(name or Path(path).name, "download")
-        )
-        _open_offer(offer).close()
-        key = secrets.token_urlsafe(16)
-        self._offers[key] = offer
-        return PREFIX + key
+        if path not in self._addresses:
+            offer = Offer(path, within.resolve(), safe_file_name(path.name, "download"))
+            _open_offer(offer).close()
+            address = self._addresses[path] = PREFIX + secrets.token_urlsafe(16)
+            self._offers[address] = offer
+        return self._addresses[path]
 
     def clear(self) -> None:
         """Withdraw all offered files (another session is opened)."""
         self._offers.clear()
+        self._addresses.clear()
 
     def open(self, address: str) -> tuple[Headers, BinaryIO] | None:
         """The headers and the open file for an address; None if it is not offered or no longer
         exists."""
         try:
-            offer = self._offers[address.removeprefix(PREFIX)]
+            offer = self._offers[address]
             file = _open_offer(offer)
         except (KeyError, InputError):
             return None

@@ -66,29 +66,25 @@ class HelpPages:
     def __init__(self, folder: Path | None = None) -> None:
         """``folder``: that of the documentation, by default the one that ships with the program."""
         place = folder or docs_folder()
-        self._pages: dict[str, Path] = {}
-        self._pictures: dict[str, Path] = {}
-        if place:
-            for path in sorted(place.rglob("*.*")):
-                name = path.relative_to(place).as_posix()
-                if path.is_file() and _is_served(name):
-                    files = self._pages if path.suffix == ".md" else self._pictures
-                    files[name] = path
+        files = [path for path in place.rglob("*.*") if path.is_file()] if place else []
+        named = {path.relative_to(place).as_posix(): path for path in files if place}
+        self._files = {name: path for name, path in named.items() if _is_served(name)}
         self._rendered: dict[str, HelpFile] = {}
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the pages, as "howto/exposure.md", in the order of their list."""
         folders = list(_GROUPS)
-        return tuple(sorted(self._pages, key=lambda name: (folders.index(_top_folder(name)), name)))
+        pages = (name for name in self._files if name.endswith(".md"))
+        return tuple(sorted(pages, key=lambda name: (folders.index(_top_folder(name)), name)))
 
     def file(self, name: str) -> HelpFile | None:
         """Return what is at this place below PREFIX: the list of pages where it is empty; None
         where nothing is."""
-        if name in self._pictures:
-            path = self._pictures[name]
+        path = self._files.get(name)
+        if path and path.suffix in _PICTURES:
             return HelpFile(path.read_bytes(), _PICTURES[path.suffix])
-        if name and name not in self._pages:
+        if name and path is None:
             return None
         if name not in self._rendered:
             self._rendered[name] = HelpFile(self._render(name).encode(), _HTML)
@@ -96,12 +92,12 @@ class HelpPages:
 
     def anchors(self, name: str) -> tuple[str, ...]:
         """Return the anchors of a page, one for each heading. Raises KeyError."""
-        return tuple(heading.anchor for heading in _list_headings(_parse(self._pages[name])))
+        return tuple(heading.anchor for heading in _list_headings(_parse(self._files[name])))
 
     def _render(self, name: str) -> str:
         """Return the HTML of a page, or of the list of pages."""
         parser = _parser()
-        tokens = _parse(self._pages[name]) if name else []
+        tokens = _parse(self._files[name]) if name else []
         headings = _list_headings(tokens)
         openings = (token for token in tokens if token.type == "heading_open")
         for token, heading in zip(openings, headings, strict=True):
@@ -143,11 +139,11 @@ class HelpPages:
     def _is_known(self, address: str, name: str) -> bool:
         """Whether a relative address on the page ``name`` is that of a page or picture."""
         target = posixpath.normpath(posixpath.join(posixpath.dirname(name), address))
-        return target in self._pages or target in self._pictures
+        return target in self._files
 
     def _title(self, name: str) -> str:
         """Return the first heading of a page, else its name."""
-        return _read_title(self._pages[name]) or name
+        return _read_title(self._files[name]) or name
 
 
 def docs_folder() -> Path | None:

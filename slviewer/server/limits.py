@@ -6,10 +6,9 @@ import ipaddress
 import logging
 import socket
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable
 from http import HTTPStatus
+from time import monotonic
 from typing import Any
 
 from slviewer.server.access import Refusal, Role
@@ -48,7 +47,7 @@ class Listener(socket.socket):
     def accept(self) -> tuple[socket.socket, Any]:
         """As socket's. Raises BlockingIOError where others should be served, or be closed,
         before."""
-        now = time.monotonic()
+        now = monotonic()
         self._closing = {peer: begun for peer, begun in self._closing.items() if now - begun < 1.0}
         if self._batch >= ACCEPTED_AT_ONCE or len(self._closing) >= _CLOSING:
             self._batch = 0
@@ -100,16 +99,16 @@ class Listener(socket.socket):
             next(peer for peer, one in self._unauthenticated.items() if one.group == busiest)
         )
         assert oldest
-        self._closing[oldest.peer] = time.monotonic()
+        self._closing[oldest.peer] = monotonic()
         with contextlib.suppress(OSError):  # it is closed as soon as its transport reads the end
             oldest.shutdown(socket.SHUT_RDWR)
         self._closed_count += 1
-        if time.monotonic() - self._log_time >= _LOG_SECONDS:
+        if monotonic() - self._log_time >= _LOG_SECONDS:
             logger.warning(
                 "%d connections without a valid link were closed: too many at a time",
                 self._closed_count,
             )
-            self._closed_count, self._log_time = 0, time.monotonic()
+            self._closed_count, self._log_time = 0, monotonic()
 
 
 class _Accepted(socket.socket):
@@ -160,14 +159,13 @@ class OncePerSecond(logging.Filter):
     """Drops a log record where one of the same message and error was logged within the last
     second."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._clock = clock
         self._times: dict[Any, float] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether the record is logged."""
-        now = self._clock()
+        now = monotonic()
         error = record.exc_info[0] if record.exc_info else None
         fault = record.name, record.levelno, str(record.msg)[:200], error
         if now - self._times.get(fault, float("-inf")) < 1.0:

@@ -25,9 +25,8 @@ from slviewer.server.credentials import (
     self_made_certificate,
 )
 from slviewer.server.downloads import Downloads
-from slviewer.server.gate import ViserGate
+from slviewer.server.gate import UploadBudget, ViserGate
 from slviewer.server.limits import Admissions, limit_log, raise_descriptor_limit
-from slviewer.server.uploads import UploadBudget
 from slviewer.server.viser_internals import ViserClient
 
 MESSAGE_LIMIT = 32 * 2**20
@@ -164,9 +163,7 @@ class SafeServer:
         return ipaddress.ip_address(self.viser.get_host().partition("%")[0])
 
 
-def serve(
-    serving: Serving, *, label: str | None = None, upload_limit: int = 256 * 10**6
-) -> SafeServer:
+def serve(serving: Serving, *, upload_limit: int = 256 * 10**6) -> SafeServer:
     """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
 
     Raises SlviewerError within two seconds where the address can't be served, where viser is not
@@ -230,7 +227,7 @@ def serve(
                 options.update(ssl=context, ssl_handshake_timeout=REQUEST_SECONDS)
             return serve_websockets(handle, **options)
 
-        server = viser_internals.start(serve_viser, address, port, label)
+        server = viser_internals.start(serve_viser, address, port)
         started.append(server)
     except BaseException:
         sock.close()

@@ -6,8 +6,8 @@ picture on its way to it and no more.
 """
 
 import threading
-import time
 from collections.abc import Callable
+from time import monotonic
 
 import viser
 
@@ -22,13 +22,8 @@ class Viewers:
     called on the server's own, whenever one has caught up, and must return at once.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        answered: Callable[[], None],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._server, self._answered, self._clock = server, answered, clock
+    def __init__(self, server: viser.ViserServer, answered: Callable[[], None]) -> None:
+        self._server, self._answered = server, answered
         self._lock = threading.Lock()
         self._request_times: dict[int, float] = {}
         self._durations: dict[int, float] = {}
@@ -52,14 +47,14 @@ class Viewers:
         """Mark that something was sent to this client: it is not ready until it has drawn it."""
         number = client.client_id
         with self._lock:
-            self._request_times[number] = self._clock()
+            self._request_times[number] = monotonic()
 
         def record_answer() -> None:
             """Record how long the client took, s, and call `answered`."""
             with self._lock:
                 sent_s = self._request_times.pop(number, None)
                 if sent_s is not None:
-                    self._durations[number] = min(self._clock() - sent_s, STALLED_S)
+                    self._durations[number] = min(monotonic() - sent_s, STALLED_S)
             self._answered()
 
         viser_internals.request_answer(client, record_answer)
@@ -67,7 +62,7 @@ class Viewers:
     def slowest_s(self) -> float:
         """Time, s, that the slowest client took to draw its last update, stalled ones excluded; 0
         if there is none."""
-        now = self._clock()
+        now = monotonic()
         with self._lock:
             waiting = [
                 now - sent_s for sent_s in self._request_times.values() if now - sent_s < STALLED_S

@@ -75,13 +75,13 @@ class _Websockets:
         return getattr(websockets, name)
 
 
-def start(serve: Callable[..., Any], host: str, port: int, label: str | None) -> viser.ViserServer:
+def start(serve: Callable[..., Any], host: str, port: int) -> viser.ViserServer:
     """Start viser's server, listening through `serve` (called as websockets' own), without a share
     tunnel or output."""
     with _starting, _silence_prints():
         _infra.websockets = _Websockets(serve)  # type: ignore[assignment]
         try:
-            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+            server = viser.ViserServer(host=host, port=port, label="slviewer", verbose=False)
         finally:
             _infra.websockets = websockets
     for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):

@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from facts import missing_facts
 
-from slviewer.gui.measure_drawing import drawn, label, lifted
 from slviewer.gui.measure_list import (
     cursor_html,
     cursor_points,
     deviation_figure,
+    drawn,
+    label,
+    lifted,
     measurement_html,
     measurements_table,
 )
-from slviewer.gui.measure_surface import paint_surface
-from slviewer.gui.steps.measure import COMPARE, FIT, PICK, Tool
+from slviewer.gui.steps.measure import COMPARE, FIT, PICK, Tool, paint_surface
 from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane

@@ -478,7 +478,7 @@ def test_comparison_and_verdict_as_html() -> None:
 
 def test_painter_draws_latest_request_and_survives_failures() -> None:
     failures: list[BaseException] = []
-    painter = Painter(failures.append)
+    painter = Painter(failures.append, threading.Lock())
     begun, go, done = threading.Event(), threading.Event(), threading.Event()
     shown: list[object] = []
 
@@ -487,13 +487,13 @@ def test_painter_draws_latest_request_and_survives_failures() -> None:
         go.wait(PATIENCE_S)
         return "old"
 
-    painter.request("place", 1, slow, shown.append)
+    painter.request(shown.append, 1, slow)
     assert begun.wait(PATIENCE_S)
-    painter.request("place", 2, lambda: 1 / 0, shown.append)
-    painter.request("place", 3, lambda: "new", shown.append)
-    painter.request("place", 3, lambda: "the same again", shown.append)
-    painter.request("broken", 1, lambda: 1 / 0, shown.append)
-    painter.request("last", 1, lambda: "last", lambda made: (shown.append(made), done.set()))
+    painter.request(shown.append, 2, lambda: 1 / 0)
+    painter.request(shown.append, 3, lambda: "new")
+    painter.request(shown.append, 3, lambda: "the same again")
+    painter.request_once(shown.append, lambda: 1 / 0)
+    painter.request_once(lambda made: (shown.append(made), done.set()), lambda: "last")
     go.set()
     assert done.wait(PATIENCE_S)
     assert shown == ["new", "last"] and [type(f) for f in failures] == [ZeroDivisionError]

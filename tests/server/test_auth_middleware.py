@@ -143,9 +143,10 @@ def test_a_one_time_link_opens_once(server, stranger):
     assert stranger.log_in(token).status == 403 and not server.access.is_pending(token)
 
 
-def test_a_one_time_link_expires():
+def test_a_one_time_link_expires(monkeypatch):
     clock = SteppingClock()
-    rules = Access(1, clock=clock.now)
+    monkeypatch.setattr("slviewer.server.access.monotonic", clock.now)
+    rules = Access(1)
     early, late = rules.issue_one_time_token(), rules.issue_one_time_token()
     clock.sleep(ONE_TIME_SECONDS - 1)
     assert rules.is_pending(early) and rules.exchange(early, "192.0.2.1").role == "operate"
@@ -156,9 +157,10 @@ def test_a_one_time_link_expires():
     assert refused.value.status == 403
 
 
-def test_wrong_tokens_are_limited_and_lock_out_no_random_one():
+def test_wrong_tokens_are_limited_and_lock_out_no_random_one(monkeypatch):
     clock = SteppingClock()
-    rules = Access(1, {"watch": "aaaaaaaaaaaaaaaa"}, clock=clock.now)
+    monkeypatch.setattr("slviewer.server.access.monotonic", clock.now)
+    rules = Access(1, {"watch": "aaaaaaaaaaaaaaaa"})
     statuses = []
     for n in range(WRONG_TOKENS + 2):
         with pytest.raises(Refusal) as refused:

@@ -13,8 +13,7 @@ from server_client import CAMERA, announced, settle
 from slviewer.errors import SlviewerError
 from slviewer.server import viser_internals
 from slviewer.server.access import ROLES, MessageRefused
-from slviewer.server.gate import MESSAGES, ViserGate
-from slviewer.server.uploads import UploadBudget
+from slviewer.server.gate import MESSAGES, UploadBudget, ViserGate
 
 
 def test_the_operator_works(operator, gui):

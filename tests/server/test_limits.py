@@ -126,9 +126,10 @@ def test_addresses_of_one_subscriber_are_one():
     assert address_group("fe80::1%eth0") == address_group("fe80::2%eth0")
 
 
-def test_a_fault_is_logged_once_a_second():
+def test_a_fault_is_logged_once_a_second(monkeypatch):
     clock = SteppingClock()
-    records = OncePerSecond(clock.now)
+    monkeypatch.setattr("slviewer.server.limits.monotonic", clock.now)
+    records = OncePerSecond()
 
     def passes(text: str, error: type[Exception] | None = None) -> bool:
         info = (error, error(), None) if error else None

@@ -29,12 +29,13 @@ def asked(client: Client) -> int:
 
 
 def test_each_is_ready_once_it_has_drawn_what_it_was_sent(
-    server: SafeServer, operator: Browser, watcher: Browser
+    server: SafeServer, operator: Browser, watcher: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     quick, slow = operator.client(), watcher.client()
     heard = threading.Event()
     clock = SteppingClock()
-    viewers = Viewers(server.viser, heard.set, clock.now)
+    monkeypatch.setattr("slviewer.server.viewers.monotonic", clock.now)
+    viewers = Viewers(server.viser, heard.set)
 
     def ready() -> set[int]:
         return {client.client_id for client in viewers.ready()} & {quick.number, slow.number}

@@ -15,7 +15,7 @@ from viser.infra import _messages as infra_messages
 
 from slviewer.errors import SlviewerError
 from slviewer.server import viser_internals
-from slviewer.server.responses import script_hash
+from slviewer.server.auth_middleware import script_hash
 
 SOURCES = {
     _infra.WebsockServer._background_worker: "59b19aac01fb31a3",

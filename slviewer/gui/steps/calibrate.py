@@ -2,12 +2,12 @@
 pixels."""
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from slviewer.fringe.sequence import Axis
-from slviewer.gui.panel import Choice, Setting, StepPanel, scan_options
+from slviewer.gui.panel import StepPanel, scan_options
 from slviewer.gui.scene import Click
 from slviewer.gui.widgets import (
     PLOT_PX,
@@ -36,7 +36,7 @@ from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.report.session import CalibrationFigures, lens_table, rig_table
 from slviewer.target.board import Board
 from slviewer.wizard import result_views
-from slviewer.wizard.snapshot import CalibrationView, SessionView, Snapshot
+from slviewer.wizard.snapshot import CalibrationView
 
 DEVICES = ("camera", "projector")
 USUAL_WEIGHT = "80 % or more is usual"
@@ -66,24 +66,24 @@ class CalibratePanel(StepPanel):
 
     def build(self) -> None:
         """Create the inputs, plots and tables."""
-        gui, context, operator = self._gui, self._context, self._operator
-        self._boards = self._scene.layer("calibrated boards")
-        self.layers.append(self._boards)
-        self._calibrate = context.button("Calibrate", operator.calibrate, "target", None)
+        gui, operator = self._gui, self._operator
+        self._boards = self._scene.layer("calibrate/boards")
+        self._calibrate = self.button("Calibrate", operator.calibrate, "target", None)
         self._verdict = Text(gui)
-        anyway = gui.add_checkbox(
-            "Accept anyway", False, hint="Uses this calibration although it was rejected"
+        self._anyway = self.setting(
+            self.checkbox("Accept anyway", "Uses this calibration although it was rejected"),
+            operator.accept_rejected_calibration,
         )
-        self._anyway = Setting(context, anyway, operator.accept_rejected_calibration)
-        self._named = gui.add_button_group("Show pose", ("–",))
-        self._named.on_click(context.callback(lambda: self._pose.choose(self._named.value)))
+        self._named = self.button_group("Show pose", "–", lambda name: self._pose.choose(name))
         self._summary = Text(gui)
         with gui.add_folder("Models") as self._models_folder:
             self._choice_note = Text(gui)
-            self._use = use = Choice(context, "Model", hint="Used for scans and verifications")
-            choose = lambda: operator.choose_model(use.value)  # noqa: E731
-            context.on_change(choose, use.handle, by_user=True)
-            self._compare = context.button(
+            self._use = self.choice(
+                "Model",
+                "Used for scans and verifications",
+                do=lambda: operator.choose_model(self._use.value),
+            )
+            self._compare = self.button(
                 "Compare models", operator.compare_models, "scale",
                 hint="Cross-validation: measures each pose by calibrations without it; "
                 "takes a minute or more",
@@ -91,40 +91,28 @@ class CalibratePanel(StepPanel):
             self._comparison = Text(gui)
         with gui.add_folder("Reprojection error") as self._poses_folder:
             self._bars = Plot(gui)
-            self._pose = Choice(context, "Pose", self._refresh)
+            self._pose = self.choice("Pose")
             self._pose_note = Text(gui)
-            self._exclude = context.button("Exclude this pose", self._toggle_pose, color="orange")
-            self._device = gui.add_dropdown("Residuals", DEVICES)
+            self._exclude = self.button("Exclude this pose", self._toggle_pose, color="orange")
+            self._device = self.dropdown("Residuals", DEVICES)
             self._arrows = Plot(gui)
         with gui.add_folder("Parameters", expand_by_default=False) as self._parameters_folder:
             self._parameters = Text(gui)
         with gui.add_folder("Pixel-wise model") as self._pixels_folder:
             self._fits = Text(gui)
-            self._axis = Choice(
-                context,
-                "Axis",
-                self._refresh,
-                hint="x: along the projector's columns; y: along its rows",
-            )
+            self._axis = self.choice("Axis", "x: along the projector's columns; y: along its rows")
             self._maps = Plot(gui)
-            self._column: Any = gui.add_number("Pixel u", 0, min=0, step=1, hint="Column")
-            self._row: Any = gui.add_number("Pixel v", 0, min=0, step=1, hint="Row")
-            self._over = Choice(
-                context,
-                "Cloud",
-                self._request_cloud,
-                hint="Click a point of it to choose its pixel",
-            )
-            context.view_button(self.get_points)
+            self._column = self.number("Pixel u", 0, 0, step=1, hint="Column")
+            self._row = self.number("Pixel v", 0, 0, step=1, hint="Row")
+            self._over = self.choice("Cloud", "Click a point of it to choose its pixel")
+            self.view_button()
             self._curve_note = Text(gui)
             self._curves = Plot(gui)
-        context.on_change(self._refresh, self._device, self._column, self._row)
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Show the calibration of a snapshot, and request its pictures."""
-        session, calibration = self._session, snapshot.calibration
-        blocked = snapshot.step(self.key).state == "blocked"
-        self._calibrate.disabled = snapshot.is_busy or blocked
+    def draw(self) -> None:
+        """Show the calibration, and request the pictures of the chosen pose, axis and pixel."""
+        snapshot, session, calibration = self.snapshot, self.session, self.session.calibration
+        self._calibrate.disabled = snapshot.is_busy or self.is_blocked
         self._calibrate.label = "Calibrate again" if calibration else "Calibrate"
         self._draw_verdict(session.verdict)
         self._poses_folder.visible = bool(calibration and calibration.stereo.poses)
@@ -144,7 +132,7 @@ class CalibratePanel(StepPanel):
         rms = {name: max(rms) for name, rms in calibration.stereo.pose_rms_px.items()}
         self._pose.offer_names(names, max(rms, key=rms.__getitem__, default=""))
         clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
-        self._over.offer([("", "none"), *clouds])
+        self._over.offer({"none": ""} | clouds)
         if calibration.pixelwise:
             self._axis.offer_names(calibration.pixelwise.axes)
             self._fits.set(report_table(calibration.pixelwise.table()))
@@ -152,11 +140,11 @@ class CalibratePanel(StepPanel):
             self._pixel_chosen = True
             u, v = np.round(calibration.stereo.rig.camera.K[:2, 2]).astype(int)
             self._column.value, self._row.value = max(int(u), 0), max(int(v), 0)
-        self._refresh()
+        self._request_pictures(calibration)
 
     def _draw_verdict(self, verdict: Verdict | None) -> None:
         """Show the verdict, and the poses that it names."""
-        session, calibration = self._session, self._session.calibration
+        session, calibration = self.session, self.session.calibration
         if verdict:
             self._verdict.set(verdict_html(verdict, session.verdict_of_calibration, calibration))
         elif calibration and calibration.stereo.board:
@@ -173,11 +161,11 @@ class CalibratePanel(StepPanel):
 
     def _draw_models(self, calibration: CalibrationView, busy: bool) -> None:
         """Show the choice and the comparison of the models."""
-        found = self._session.list_records(ModelComparison)
+        found = self.session.list_records(ModelComparison)
         compared = next((each.record for each in found if not each.stale), None)
         self._choice_note.set(model_choice_html(calibration, compared))
-        options = [("", f"{calibration.recommended} (recommended)")]
-        options += [(model, model) for model in calibration.models]
+        options = {f"{calibration.recommended} (recommended)": ""}
+        options |= {model: model for model in calibration.models}
         self._use.offer(options, calibration.chosen)
         if calibration.chosen != self._chosen:
             self._chosen = calibration.chosen
@@ -198,54 +186,41 @@ class CalibratePanel(StepPanel):
 
     # pictures
 
-    def _refresh(self) -> None:
+    def _request_pictures(self, calibration: CalibrationView) -> None:
         """Request the pictures of the chosen pose, axis and pixel."""
-        with self._lock:
-            session, calibration = self._session, self._session.calibration
-            if calibration is None:
-                return
-            context, stereo, request = self._context, calibration.stereo, self.painter.request
-            made = fingerprint(calibration)
-            if stereo.poses:
-                request(
-                    "bars",
-                    made,
-                    lambda: pose_bars(
-                        stereo.pose_rms_px, stereo.reprojection_rms_px, width=PLOT_PX
-                    ),
-                    self._bars.set,
-                )
-            self._draw_pose(calibration)
-            self._draw_boards(session, calibration)
+        context, stereo, request = self.context, calibration.stereo, self.painter.request
+        made = fingerprint(calibration)
+        if stereo.poses:
             request(
-                "parameters",
+                self._bars.set,
                 made,
-                lambda: _parameters(self._load_details(made)),
-                self._parameters.set,
+                lambda: pose_bars(stereo.pose_rms_px, stereo.reprojection_rms_px, width=PLOT_PX),
             )
-            axis = cast(Axis, self._axis.value)
-            if calibration.pixelwise is None or axis not in calibration.pixelwise.axes:
-                return
-            request(
-                "maps",
-                (made, axis),
-                lambda: rms_maps(
-                    result_views.pixel_fits(context.session)[axis].rms_mm, axis, width=PLOT_PX
-                ),
-                self._maps.set,
-            )
-            pixel = (int(self._column.value), int(self._row.value))
-            request(
-                "curves",
-                (made, axis, pixel),
-                lambda: (pixel, result_views.pixel_curve(context.session, pixel, axis)),
-                self._draw_curve,
-            )
+        self._draw_pose(calibration)
+        self._draw_boards(calibration)
+        self._request_cloud()
+        request(self._parameters.set, made, lambda: _parameters(self._load_details(made)))
+        axis: Axis = self._axis.value
+        if calibration.pixelwise is None or axis not in calibration.pixelwise.axes:
+            return
+        request(
+            self._maps.set,
+            (made, axis),
+            lambda: rms_maps(
+                result_views.pixel_fits(context.session)[axis].rms_mm, axis, width=PLOT_PX
+            ),
+        )
+        pixel = (int(self._column.value), int(self._row.value))
+        request(
+            self._draw_curve,
+            (made, axis, pixel),
+            lambda: (pixel, result_views.pixel_curve(context.session, pixel, axis)),
+        )
 
     def _draw_pose(self, calibration: CalibrationView) -> None:
         """Show the reprojection error of the chosen pose, and request its residuals as arrows."""
         name, device = self._pose.value, self._device.value
-        pose = self._snapshot.pose(name)
+        pose = self.snapshot.pose(name)
         if pose is None:
             return
         excluded = pose.state == "excluded"
@@ -256,7 +231,7 @@ class CalibratePanel(StepPanel):
             self._pose_note.write(
                 f"{name} is not in this calibration ({pose.state}{why}).", "warning"
             )
-            self.painter.cancel("arrows")
+            self.painter.cancel(self._arrows.set)
             self._arrows.set(None)
             return
         text = f"{name}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
@@ -280,18 +255,15 @@ class CalibratePanel(StepPanel):
                 f"{name}, {device}", *residuals[device], getattr(rig, device).size
             )
 
-        self.painter.request("arrows", (made, name, device), arrows, self._arrows.set)
+        self.painter.request(self._arrows.set, (made, name, device), arrows)
 
-    def _draw_boards(self, session: SessionView, calibration: CalibrationView) -> None:
+    def _draw_boards(self, calibration: CalibrationView) -> None:
         """Draw the poses in 3D, coloured from green to red by reprojection error, the chosen one
         thick."""
-        stereo, chosen, covered = calibration.stereo, self._pose.value, bool(self._over.value)
-        key = (
-            fingerprint(calibration),
-            chosen,
-            covered,
-            tuple((p.name, p.state) for p in session.poses),
-        )
+        stereo, poses = calibration.stereo, self.session.poses
+        chosen, covered = self._pose.value, bool(self._over.value)
+        states = tuple((pose.name, pose.state) for pose in poses)
+        key = (fingerprint(calibration), chosen, covered, states)
         if key == self._drawn_boards:
             return
         self._drawn_boards = key
@@ -301,7 +273,7 @@ class CalibratePanel(StepPanel):
         outline = Board.parse(stereo.board).outline()
         worst_px = {name: max(rms) for name, rms in stereo.pose_rms_px.items()}
         usual = np.sqrt(np.mean(np.square([*worst_px.values()] or [1.0])))
-        for pose in session.poses:
+        for pose in poses:
             if pose.T_camera_board is not None and pose.name in worst_px:
                 share = float(np.clip(worst_px[pose.name] / usual - 0.5, 0, 1))
                 here = pose.name == chosen
@@ -318,7 +290,7 @@ class CalibratePanel(StepPanel):
     def _load_details(self, made: tuple[Any, ...]) -> CalibrationFigures:
         """Return the calibration with its residuals, read once, on the painter's thread."""
         if self._details is None or self._details[0] != made:
-            self._details = made, calibration_view(self._context.session)
+            self._details = made, calibration_view(self.context.session)
         return self._details[1]
 
     def _draw_curve(self, made: tuple[tuple[int, int], PixelCurve | None]) -> None:
@@ -336,8 +308,8 @@ class CalibratePanel(StepPanel):
 
     def _toggle_pose(self) -> None:
         """Request that the chosen pose be excluded, or included again."""
-        pose = self._snapshot.pose(self._pose.value)
-        if pose is not None:
+        pose = self.snapshot.pose(self._pose.value)
+        if pose:
             is_excluded = pose.state == "excluded"
             (self._operator.include if is_excluded else self._operator.exclude)(pose.name)
 
@@ -345,34 +317,30 @@ class CalibratePanel(StepPanel):
         """Request the chosen cloud; without one, show the calibrated boards."""
         name = self._over.value
         if not name:
-            self.painter.cancel("cloud")
+            self.painter.cancel(self._draw_cloud)
             self._cloud = self._shown = None
             self.layer.clear()
-            self._context.viewpoints.overview()
-        self._refresh()
-        if name:
+            self.context.viewpoints.overview()
+        else:
             self.painter.request(
-                "cloud",
-                name,
-                lambda: result_views.load_scan_cloud(self._context.session, name),
                 self._draw_cloud,
+                name,
+                lambda: result_views.load_scan_cloud(self.context.session, name),
             )
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
         """Draw a cloud, coloured by depth, to choose pixels on."""
         self._cloud = cloud
-        self.layer.cloud("cloud", cloud.points, paint(cloud.points[..., 2], "mm", 1, "")[0])
-        self.show_points(cloud.name, cloud.points)
+        painted, _ = paint(cloud.points[..., 2], "mm", 1, "")
+        self.show_cloud(cloud.name, cloud.points, painted)
 
     def _pick_pixel(self, click: Click) -> None:
         """Choose the pixel whose point is closest to the clicked ray."""
         cloud = self._cloud
-        pixel = None if cloud is None else cloud.nearest(click.origin, click.direction)
-        if cloud is None or pixel is None:
-            return
-        u, v = pixel
-        self._column.value, self._row.value = pixel
-        self.layer.mark("picked", cloud.points[v, u], f"pixel ({u}, {v})")
+        if cloud and (pixel := cloud.nearest(click.origin, click.direction)):
+            u, v = self._column.value, self._row.value = pixel
+            self.layer.mark("picked", cloud.points[v, u], f"pixel ({u}, {v})")
+            self.redraw()
 
 
 def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:

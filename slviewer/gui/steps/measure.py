@@ -1,25 +1,158 @@
-"""Step 8: distances, fitted shapes, sections, and deviations from a nominal model."""
+"""Step 8: distances, fitted shapes, sections, and deviations from a nominal model, on a surface
+that is chosen, drawn in 3D and picked on."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 
-from slviewer.gui.inspection_inputs import InspectionInputs
-from slviewer.gui.measure_list import MeasurementList
-from slviewer.gui.measure_surface import SurfaceView
-from slviewer.gui.panel import NO_SESSION, Choice, StepPanel
+from slviewer.gui.measure_list import InspectionInputs, MeasurementList
+from slviewer.gui.panel import NO_SESSION, PanelPart, StepPanel, scan_options
 from slviewer.gui.scene import Click
-from slviewer.gui.widgets import Html, Text, to_html
+from slviewer.gui.steps.scan import sort_scans
+from slviewer.gui.widgets import Html, Text, colour_bar, note, paint, to_html
+from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measure import Place, What
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.measure import MERGED, MeasuredSurface, Place, What
+from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.measurement import Measurement
 from slviewer.report.canvas import round_up
-from slviewer.session.nominal import MM
+from slviewer.session.nominal import MM, Units
 from slviewer.surface.selection import ViewCamera
-from slviewer.wizard.snapshot import SessionView, Snapshot
-from slviewer.wizard.surfaces import box_in_view, point_at
+from slviewer.wizard.snapshot import SessionView
+from slviewer.wizard.surfaces import box_in_view, place_at, point_at
+
+COLOURS = ("texture", "depth", "uncertainty")
+DEVIATION = "deviation"
+
+
+class SurfaceView(PanelPart):
+    """View of the chosen surface, ``on``: None until it is loaded."""
+
+    on: MeasuredSurface | None = None
+    _deviation: Stored[Measurement] | None = None
+
+    def build(self) -> None:
+        """Create the inputs."""
+        self._versions: dict[str, Any] = {}
+        self._choice = self.choice("Surface")
+        self._colour = self.dropdown("Colour", COLOURS)
+        self._legend = Text(self._gui)
+        self.panel.view_button()
+
+    @property
+    def name(self) -> str:
+        """The chosen scan or merge; empty where there is none."""
+        return str(self._choice.value)
+
+    def offer(self, session: SessionView) -> None:
+        """Offer the surfaces that can be measured on, and draw the chosen one."""
+        scans = [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"]
+        offered = scan_options(scans)
+        self._versions = {
+            scan.name: (session.folder, scan.figures, *session.restriction(scan.name))
+            for scan in scans
+        }
+        merge = session.merge
+        if merge and not merge.stale:
+            name = offered[f"Merge of {len(merge.record.scans)} scans"] = f"{MERGED}{merge.name}"
+            self._versions[name] = (session.folder, merge.record.points)
+        self._choice.offer(offered)
+        self._request()
+
+    def show_measurement(self, measured: Stored[Measurement] | None) -> None:
+        """Show the surface on which a measurement was made, coloured by its deviation if it has
+        one; None: as chosen."""
+        if measured:
+            self._choice.choose(measured.record.source)
+            if measured.record.deviation is None:
+                measured = None
+        self._deviation = measured
+        options = COLOURS if measured is None else (*COLOURS, DEVIATION)
+        if self._colour.options != options:
+            self._colour.options = options  # a colour that is no longer offered becomes the first
+        if measured:
+            self._colour.value = DEVIATION
+        self._request()
+
+    def pick(self, click: Click, do: Callable[[Place], None]) -> None:
+        """Call ``do(place)`` later with the point that a click meets; not called where it misses
+        the surface."""
+        on = self.on
+        if on is None:
+            return
+
+        def picked(place: Place | None) -> None:
+            """Pass the place on, unless the ray has missed or another surface is shown by now."""
+            if place is not None and on is self.on:
+                do(place)
+
+        self._painter.request_once(picked, lambda: place_at(on, click.origin, click.direction))
+
+    def _request(self) -> None:
+        """Request the chosen surface in the chosen colours."""
+        name, colour, shown = self.name, self._colour.value, self._deviation
+        if not name:
+            self.on = None
+            self._painter.cancel(self._draw_surface)
+            self._layer.remove("surface")
+            self._legend.set("")
+            return
+        if shown and (shown.record.source != name or colour != DEVIATION):
+            shown = None
+        key = (name, self._versions.get(name), colour if shown is None else shown.name)
+
+        def make() -> tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]:
+            """Load the surface; returns (surface, points, colours, legend)."""
+            on = self._operator.surface(name)
+            if shown is None:
+                return (on, *paint_surface(on, COLOURS[0] if colour == DEVIATION else colour))
+            assert shown.record.deviation is not None
+            arrays = load_arrays(self.context.session, f"{Measurement.kind}/{shown.name}")
+            return (on, *_colour_by_deviation(arrays, shown.record.deviation.tolerance_mm))
+
+        self._painter.request(self._draw_surface, key, make)
+
+    def _draw_surface(self, made: tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]) -> None:
+        """Draw the loaded surface and its legend; report a new one."""
+        on, points, painted, bar = made
+        is_new = on is not self.on
+        self.on = on
+        self._layer.cloud("surface", points, painted)
+        self._legend.set(bar)
+        if is_new:
+            self.redraw()
+        self.panel.show_points(on.source, on.points)
+
+
+def paint_surface(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
+    """Colour a surface by one of COLOURS: (points (..., 3), their colours (..., 3), the legend)."""
+    if colour == "texture" and on.texture is not None:
+        return on.points, on.texture, Html("")
+    if colour == "uncertainty":
+        sigma = on.sigma_mm if on.left_mm is None else np.hypot(on.sigma_mm, on.left_mm)
+        what = "uncertainty of z" if on.organised else "uncertainty along the normal"
+        title = f"{what} (1 sigma){'' if on.left_mm is not None else ', noise only'}"
+        return on.points, *paint(np.where(on.measured, sigma, np.nan), "mm", 3, title)
+    return on.points, *paint(on.points[..., 2], "mm", 1, "depth")
+
+
+def _colour_by_deviation(
+    arrays: dict[str, np.ndarray], tolerance: float | None
+) -> tuple[np.ndarray, np.ndarray, Html]:
+    """Colour a surface by a stored deviation: (points (n, 3) mm, colours (n, 3), legend); grey
+    where not measured."""
+    limit = colour_limit(arrays["signed"], tolerance)
+    uncovered = arrays["uncovered"].reshape(-1, 3)
+    points = np.concatenate([arrays["points"], uncovered]).astype(np.float32)
+    grey = np.broadcast_to(np.array(EXCLUDED_COLOUR, np.uint8), uncovered.shape)
+    title = "deviation; red: outside, blue: inside, grey: not measured"
+    scale = deviation_colours(np.linspace(-1, 1, 13), 1.0)
+    legend = colour_bar(f"−{limit:.3g} mm", f"+{limit:.3g} mm", scale, title)
+    return points, np.concatenate([deviation_colours(arrays["signed"], limit), grey]), legend
+
 
 UNKNOWN = "unknown"
 BALL, RECTANGLE, BOX = "ball", "rectangle", "box"
@@ -52,6 +185,11 @@ class Tool:
     def select(self, name: str) -> None:
         """Select another tool, or none; picked points and the box are dropped."""
         self.name, self.picked, self.box = name, [], None
+
+    @property
+    def what(self) -> What:
+        """What the tool measures."""
+        return cast(What, self.name.lower())
 
     @property
     def has_region(self) -> bool:
@@ -113,29 +251,29 @@ class MeasurePanel(StepPanel):
     key = "measure"
 
     _sized_for = ""
+    _on: MeasuredSurface | None = None
+    _drawn: object = None
 
     def build(self) -> None:
         """Create the inputs of surface, tools and results."""
-        gui, context, operator = self._gui, self._context, self._operator
+        gui, operator = self._gui, self._operator
         self._tool = Tool()
-        self._related: list[tuple[str, str]] = []
+        self._related: dict[str, str] = {}
         with gui.add_folder("Surface") as self._surface_folder:
-            self._surface = SurfaceView(self, self._handle_loaded)
+            self._surface = SurfaceView(self)
         with gui.add_folder("Tools") as self._tools_folder:
             for title, tools in (("Pick", PICK), ("Fit", FIT), ("Compare", COMPARE)):
-                group = gui.add_button_group(title, tools)
-                group.on_click(context.callback(lambda group=group: self._select_tool(group.value)))  # type: ignore[misc]
+                self.button_group(title, tools, self._select_tool)
             self._instruction = Text(gui)
-            self._by: Any = gui.add_dropdown("Region", (BALL, RECTANGLE))
-            context.on_change(self._change_region, self._by)
+            self._by = self.dropdown("Region", (BALL, RECTANGLE), do=self._change_region)
             self._radius: Any = gui.add_slider(
                 "Radius, mm", 0.5, 100.0, 0.5, 15.0, hint="Of the ball in 3D"
             )
-            context.on_change(self._draw_region, self._radius)
+            self.react(self._radius.on_update)
             self._inside = Text(gui)
-            self._fit = context.button("Fit", self._request_fit, "check", None)
-            self._from, self._to = Choice(context, "From"), Choice(context, "To")
-            self._relate = context.button(
+            self._fit = self.button("Fit", self._request_fit, "check", None)
+            self._from, self._to = self.choice("From"), self.choice("To")
+            self._relate = self.button(
                 "Measure relation",
                 lambda: operator.measure_between(self._from.value, self._to.value),
                 "ruler-2",
@@ -143,105 +281,92 @@ class MeasurePanel(StepPanel):
             )
             # viser cannot hide upload buttons alone
             with gui.add_folder(None) as self._nominal_folder:
-                context.upload_button(
+                self.upload_button(
                     "Upload model", operator.upload_nominal, ".stl,.ply,.obj,.step,.stp,.3mf"
                 )
-                self._nominal = Choice(context, "Nominal")
-                self._units: Any = gui.add_dropdown(
-                    "Units",
-                    (UNKNOWN, *MM),
-                    hint="Of the nominal model; unknown: mm, if the sizes agree",
+                self._nominal = self.choice("Nominal")
+                units: dict[str, Units | None] = {UNKNOWN: None, **{unit: unit for unit in MM}}
+                self._units = self.choice(
+                    "Units", "Of the nominal model; unknown: mm, if the sizes agree", units
                 )
-                self._tolerance = gui.add_number(
-                    "Tolerance ±, mm",
-                    0.0,
-                    min=0.0,
-                    max=1000.0,
-                    step=0.01,
-                    hint="0: without a verdict",
+                self._tolerance = self.number(
+                    "Tolerance ±, mm", 0.0, 0.0, 1000.0, 0.01, "0: without a verdict"
                 )
-                self._compare = context.button(
+                self._compare = self.button(
                     "Compare", self._request_comparison, "arrows-diff", None
                 )
-            self._end = context.button(
-                "End tool", lambda: self._select_tool(""), "x", hint="Key: Esc"
-            )
+            end = partial(self._select_tool, "")
+            self._end = self.button("End tool", end, "x", hint="Key: Esc")
         self._escape = gui.add_command("End the measuring tool", hotkey="escape", disabled=True)
-        self._escape.on_trigger(context.callback(lambda: self._select_tool("")))
-        self._results = MeasurementList(self, self._show_measurement)
+        self.react(self._escape.on_trigger, end)
+        self._results = MeasurementList(self)
         self._inspection = InspectionInputs(self)
-        self._draw_tool()
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Show the surfaces and measurements of a snapshot."""
-        session = self._session
-        usable = snapshot.step(self.key).state != "blocked"
-        self._surface.offer(session if usable else NO_SESSION)
-        self._surface_folder.visible = self._tools_folder.visible = bool(self._surface.name)
+    def draw(self) -> None:
+        """Show the surfaces, the measurements, and the tool."""
+        session, surface, busy = self.session, self._surface, self.snapshot.is_busy
+        surface.offer(NO_SESSION if self.is_blocked else session)
+        self._surface_folder.visible = self._tools_folder.visible = bool(surface.name)
         self._offer_inputs(session)
-        new = self._results.update(session, self._surface.name)
-        self._inspection.offer(snapshot, self._surface.name)
-        if self._tool.fits and any(each.record.what == self._tool.name.lower() for each in new):
+        new = self._results.update(surface.name)
+        if self._results.is_other:
+            surface.show_measurement(self._results.chosen)
+        self._inspection.offer(surface.name)
+        if surface.on is not self._on:
+            self._on = surface.on
+            self._handle_loaded()
+        if self._tool.fits and any(each.record.what == self._tool.what for each in new):
             self._select_tool(self._tool.name)
-        self._compare.disabled = snapshot.is_busy or not self._nominal.value
-        self._fit.disabled = snapshot.is_busy
+        self._compare.disabled = busy or not self._nominal.value
+        self._fit.disabled = busy
+        self._draw_tool()
+        self._draw_picked()
 
     def show(self, visible: bool) -> None:
         """Show or hide the panel's layer; the tool is reset, and clicks are ignored until one is
         selected."""
-        with self._lock:
-            self._visible = True  # until the clicks are left to another step
-            self._select_tool("")
-            super().show(visible)
+        self._visible = True  # until the clicks are left to another step
+        self._select_tool("")
+        super().show(visible)
 
     # tools
 
     def _select_tool(self, name: str) -> None:
         """Select a tool by name; empty: none."""
-        with self._lock:
-            self._tool.select(name)
-            if self._visible:  # before the instruction appears, so that no click is lost
-                self._escape.disabled = not name
-                rectangle = self._tool.fits and self._tool.by_rectangle
-                self._scene.on_rectangle(self._handle_rectangle if rectangle else None)
-                clicks = self._tool.clicks and not rectangle
-                self._scene.on_click(self._handle_click if clicks else None)
-            self._draw_tool()
+        self._tool.select(name)
+        if self._visible:  # before the instruction appears, so that no click is lost
+            self._escape.disabled = not name
+            rectangle = self._tool.fits and self._tool.by_rectangle
+            self._scene.on_rectangle(self._handle_rectangle if rectangle else None)
+            clicks = self._tool.clicks and not rectangle
+            self._scene.on_click(self._handle_click if clicks else None)
 
     def _change_region(self) -> None:
         """Take clicks or rectangles, as the operator chose."""
-        with self._lock:
-            self._tool.by_rectangle = self._by.value == RECTANGLE
-            self._select_tool(self._tool.name)
+        self._tool.by_rectangle = self._by.value == RECTANGLE
+        self._select_tool(self._tool.name)
 
     def _handle_rectangle(self, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> None:
         """Take the box around what a dragged rectangle shows."""
-
-        def take() -> None:
-            """Set the box, and draw it."""
-            with self._lock:
-                if self._surface.on is not None and self._tool.fits:
-                    self._tool.box = box_in_view(self._surface.on, view, low, high)
-                    self._draw_tool()
-
-        self._context.callback(take)(None)
+        if self._on is not None and self._tool.fits:
+            self._tool.box = box_in_view(self._on, view, low, high)
+            self.redraw()
 
     def _handle_click(self, click: Click) -> None:
         """Pick the point of the surface that a click meets."""
-        self._context.callback(lambda: self._surface.pick(click, self._add_pick))(None)
+        self._surface.pick(click, self._add_pick)
 
     def _add_pick(self, place: Place) -> None:
         """Add a picked point to the tool, and request the measurement once it has enough."""
-        with self._lock:
-            if not self._tool.clicks:
-                return
-            places, on = self._tool.pick(place), self._surface.name
-            self._draw_tool()
-        if places is not None:
-            self._operator.measure(on, cast(What, self._tool.name.lower()), places)
+        if not self._tool.clicks:
+            return
+        places = self._tool.pick(place)
+        self.redraw()
+        if places:
+            self._operator.measure(self._surface.name, self._tool.what, places)
 
     def _draw_tool(self) -> None:
-        """Show the instruction and the inputs of the tool, and the points picked with it."""
+        """Show the instruction and the inputs of the tool."""
         tool = self._tool
         title = f"<b>{to_html(tool.name)}</b>: " if tool.name else ""
         text = Html(title + to_html(tool.instruction))
@@ -255,101 +380,85 @@ class MeasurePanel(StepPanel):
         for handle in (self._from.handle, self._to.handle, self._relate):
             handle.visible = relation
         self._nominal_folder.visible = deviation
-        on = self._surface.on
-        marked = [] if on is None or tool.fits else tool.picked
-        self.layer.remove(*_PICKED[len(marked) :])
-        for name, place in zip(_PICKED, marked, strict=False):
-            if on is not None:
-                self.layer.mark(name, point_at(on, place), name[-1])
-        self._draw_region()
 
-    def _draw_region(self) -> None:
-        """Draw the region that a shape would be fitted to, and request its number of points."""
-        with self._lock:
-            on, region = self._surface.on, self._make_region()
-            if on is None or region is None:
-                self.layer.remove(BALL, BOX)
-                self.painter.cancel("inside")
-                self._inside.set("")
-                return
-            if region.kind == "ball":
-                self.layer.remove(BOX)
-                self.layer.ball(BALL, region.centre, float(region.size[0]))
-            else:
-                self.layer.remove(BALL)
-                self.layer.lines(BOX, region.edges(), BOX_COLOUR)
-            key = (self._surface.name, region.text())
-            self.painter.request(
-                "inside",
-                key,
-                lambda: len(on.within(region)),
-                lambda points: self._inside.write(f"{points:,} points in the {region.kind}", "dim"),
-            )
+    def _draw_picked(self) -> None:
+        """Draw the points picked with the tool, or the region that it would fit a shape to, and
+        request the region's number of points."""
+        on, tool, region = self._on, self._tool, self._make_region()
+        key = (self._surface.name, tool.name, tuple(tool.picked), region and region.text())
+        if key == self._drawn:
+            return
+        self._drawn = key
+        self.layer.remove(*_PICKED, BALL, BOX)
+        self.painter.cancel(self._inside.set)
+        self._inside.set("")
+        if on is None:
+            return
+        if region is None:
+            for name, place in zip(_PICKED, () if tool.fits else tool.picked, strict=False):
+                self.layer.mark(name, point_at(on, place), name[-1])
+            return
+        if region.kind == "ball":
+            self.layer.ball(BALL, region.centre, float(region.size[0]))
+        else:
+            self.layer.lines(BOX, region.edges(), BOX_COLOUR)
+        self.painter.request(
+            self._inside.set,
+            key,
+            lambda: note(f"{len(on.within(region)):,} points in the {region.kind}"),
+        )
 
     def _make_region(self) -> Region | None:
         """Return the ball around the picked point, or the box that was drawn; None unless the tool
         fits and has one."""
-        on = self._surface.on
-        if on is None or not self._tool.has_region:
+        if self._on is None or not self._tool.has_region:
             return None
         if self._tool.by_rectangle:
             return self._tool.box
-        return Region.ball(point_at(on, self._tool.picked[0]), float(self._radius.value))
+        return Region.ball(point_at(self._on, self._tool.picked[0]), float(self._radius.value))
 
     # the surface and the results
 
     def _handle_loaded(self) -> None:
         """Handle that another surface is shown: drop picked points, and adapt the ball to its
         size."""
-        with self._lock:
-            on = self._surface.on
-            assert on is not None
-            self._select_tool(self._tool.name)
-            self._results.change_surface(on.source)
-            if self._sized_for != on.source:
-                self._sized_for = on.source
-                low, high = np.nanpercentile(on.points.reshape(-1, 3), [2, 98], axis=0)
-                most = round_up(0.6 * float(np.linalg.norm(high - low)))
-                self._radius.max, self._radius.step, self._radius.min = most, most / 200, most / 200
-                self._radius.value = most / 5
-
-    def _show_measurement(self, measured: Stored[Measurement] | None) -> None:
-        """Show the surface on which a measurement was made."""
-        record = None if measured is None else measured.record
-        if record is not None and record.source != self._surface.name:
-            self._surface.choice.choose(record.source)
-        self._surface.show_deviation(
-            measured if record is not None and record.deviation is not None else None
-        )
+        on = self._on
+        self._select_tool(self._tool.name)
+        if on is not None and self._sized_for != on.source:
+            self._sized_for = on.source
+            low, high = np.nanpercentile(on.points.reshape(-1, 3), [2, 98], axis=0)
+            most = round_up(0.6 * float(np.linalg.norm(high - low)))
+            self._radius.max, self._radius.step, self._radius.min = most, most / 200, most / 200
+            self._radius.value = most / 5
 
     # requests
 
     def _offer_inputs(self, session: SessionView) -> None:
         """Offer the results to relate, by default the latest two, and the nominal models."""
-        related = [
-            (each.name, each.label)
+        related = {
+            each.label: each.name
             for each in session.measurements
             if each.record.what in KINDS and not each.stale
-        ]
+        }
         for choice in (self._from, self._to):
             choice.offer(related)
         # likely the latest two
         if related != self._related and len(related) > 1 and self._tool.name != COMPARE[0]:
-            self._from.choose(related[-2][0])
-            self._to.choose(related[-1][0])
+            *_, before, latest = related.values()
+            self._from.choose(before)
+            self._to.choose(latest)
         self._related = related
         self._relate.disabled = len(related) < 2
         self._nominal.offer_names(session.nominals)
 
     def _request_fit(self) -> None:
         """Request the fit of the tool's shape to the region."""
-        with self._lock:
-            region, shape = self._make_region(), cast(What, self._tool.name.lower())
-        if region is not None:
-            self._operator.measure(self._surface.name, shape, region=region)
+        if region := self._make_region():
+            self._operator.measure(self._surface.name, self._tool.what, region=region)
 
     def _request_comparison(self) -> None:
         """Request the comparison with the chosen nominal model."""
-        units = None if self._units.value == UNKNOWN else self._units.value
         tolerance = float(self._tolerance.value) or None
-        self._operator.compare_nominal(self._surface.name, self._nominal.value, units, tolerance)
+        self._operator.compare_nominal(
+            self._surface.name, self._nominal.value, self._units.value, tolerance
+        )

@@ -1,30 +1,28 @@
 """Step 7: choose scans, the reference and the initial alignment; merge, and compare before with
 after."""
 
-from typing import Any
-
 import numpy as np
 import viser
 
-from slviewer.gui.merge_picking import PointPicker
 from slviewer.gui.merge_views import (
     AFTER,
     BEFORE,
     MERGED,
     SHOWN,
     ColouredClouds,
+    PointPicker,
     colour_merge,
     colour_scans,
     merge_failure_html,
     merge_html,
     turntable_html,
 )
-from slviewer.gui.panel import Choice, StepPanel, display_name, scan_labels, scan_options
+from slviewer.gui.panel import StepPanel, display_name, scan_labels, scan_options
 from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
 from slviewer.pipeline.merge import StartKind
-from slviewer.wizard.snapshot import ScanView, SessionView, Snapshot
+from slviewer.wizard.snapshot import ScanView, SessionView
 
 FEATURES, MARKERS, PLACED, TURNTABLE = "features", "markers", "places while scanning", "turntable"
 CURRENT, PICKED = "current position", "picked points"
@@ -58,62 +56,57 @@ class MergePanel(StepPanel):
 
     def build(self) -> None:
         """Create the inputs of scans, alignment and view."""
-        gui, context, operator = self._gui, self._context, self._operator
+        gui, operator = self._gui, self._operator
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
         with gui.add_folder("Scans") as self._scans_folder:
             self._none = Text(gui)
         with gui.add_folder("Alignment") as self._alignment_folder:
-            self._reference = Choice(
-                context, "Reference", self._refresh, hint="The other scans are moved to it"
+            self._reference = self.choice("Reference", "The other scans are moved to it")
+            self._start = self.dropdown(
+                "Start from", STARTS, "Initial alignment, which is then refined", self._change_start
             )
-            self._start: Any = gui.add_dropdown(
-                "Start from", tuple(STARTS), hint="Initial alignment, which is then refined"
+            self._angle = self.number(
+                "Angle, °", 30.0, 1.0, 180.0, 0.5, "Of the turntable, from each scan to the next"
             )
-            context.on_change(self._change_start, self._start)
-            context.on_change(self._keep_start, self._start, by_user=True)
-            self._angle: Any = gui.add_number(
-                "Angle, °", 30.0, min=1.0, max=180.0, step=0.5,
-                hint="Of the turntable, from each scan to the next",
-            )  # fmt: skip
-            context.on_change(self._refresh, self._angle)
             self._start_note = Text(gui)
-            self._picker = PointPicker(self, self._refresh)
-            self._merge = context.button("Merge", self._request_merge, "layers-intersect", None)
+            self._picker = PointPicker(self)
+            self._merge = self.button("Merge", self._request_merge, "layers-intersect", None)
             self._failure = Text(gui)
         self._result = Text(gui)
-        self._undo = context.button("Undo merge", operator.undo_merge, "arrow-back-up", "orange")
-        self._view = Choice(context, "3D view", self._refresh)
+        self._undo = self.button("Undo merge", operator.undo_merge, "arrow-back-up", "orange")
+        self._view = self.choice("3D view")
         self._legend = Text(gui)
-        context.view_button(self.get_points)
+        self.view_button()
         self._editing = PointEditing(self, self._redraw)
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Show the scans and the merge of a snapshot."""
-        session, merge, failure = self._session, self._session.merge, snapshot.merge_failure
+    def draw(self) -> None:
+        """Show the scans and the merge, and request the clouds of the chosen view."""
+        session, merge, failure = self.session, self.session.merge, self.snapshot.merge_failure
         scans = _list_mergeable(session)
         self._draw_boxes(scans)
         preferred = merge.record.reference if merge else scans[-1].name if scans else ""
         self._reference.offer(scan_options(scans), preferred)
         self._alignment_folder.visible = len(scans) > 1
         self._undo.visible = merge is not None
-        labels = {scan.name: scan.label for scan in scans}
+        labels = scan_labels(session)
         self._result.set(merge_html(merge, labels) if merge else "")
         self._failure.set(
-            merge_failure_html(failure, labels, merge, snapshot.merge_refusal) if failure else ""
+            merge_failure_html(failure, labels, merge, self.snapshot.merge_refusal)
+            if failure
+            else ""
         )
-        self._offer_views()
         self._propose_start()
-        number = int(merge.name) if merge is not None else 0
+        self._offer_views()
+        number = int(merge.name) if merge else 0
         if self._merged is not None and number > self._merged:
             self._view.choose(AFTER)  # show what was just merged
         self._merged = number
-        self._refresh()
+        self._draw_choice(labels)
 
     def show(self, visible: bool) -> None:
         """Show or hide the panel's layers."""
-        with self._lock:
-            super().show(visible)
-            self._show_layers()
+        super().show(visible)
+        self._show_layers()
 
     # drawing
 
@@ -130,23 +123,17 @@ class MergePanel(StepPanel):
                 label = display_name(scan.name, label)
             if scan.name not in self._boxes:
                 with self._scans_folder:
-                    box = self._gui.add_checkbox(label, True)
-                self._context.on_change(self._refresh, box)
-                self._boxes[scan.name] = box
+                    self._boxes[scan.name] = self.checkbox(label, value=True)
             self._boxes[scan.name].label = label
 
     def _offer_views(self) -> None:
         """Offer the 3D views: before and after the merge, merged, or side by side to pick
         points."""
-        views = [AFTER, BEFORE, *MERGED] if self._session.merge else [BEFORE]
+        views = [AFTER, BEFORE, *MERGED] if self.session.merge else [BEFORE]
         if self._start.value == PICKED:
             views.append(SIDE_BY_SIDE)
         self._view.offer_names(views)
         self._view.handle.visible = len(views) > 1
-
-    def _keep_start(self) -> None:
-        """Keep the operator's choice of the initial alignment."""
-        self._is_start_chosen = True
 
     def _propose_start(self) -> None:
         """Choose the initial alignment that the chosen scans bring along, unless the operator chose
@@ -159,19 +146,18 @@ class MergePanel(StepPanel):
         self._start.value = TURNTABLE if turned else PLACED if placed else FEATURES
 
     def _change_start(self) -> None:
-        """Update the views for another initial alignment; picked points are shown side by side."""
-        with self._lock:
-            self._offer_views()
-            if self._start.value == PICKED:
-                self._view.choose(SIDE_BY_SIDE)
-            self._refresh()
+        """Keep the operator's choice of the initial alignment; points are picked side by side."""
+        self._is_start_chosen = True
+        self._offer_views()
+        if self._start.value == PICKED:
+            self._view.choose(SIDE_BY_SIDE)
 
     def _list_chosen(self) -> list[ScanView]:
         """List the scans to merge, with the reference, in the order of their capture."""
         boxes, reference = self._boxes, self._reference.value
         return [
             scan
-            for scan in _list_mergeable(self._session)
+            for scan in _list_mergeable(self.session)
             if scan.name == reference or (scan.name in boxes and boxes[scan.name].value)
         ]
 
@@ -190,36 +176,32 @@ class MergePanel(StepPanel):
         """Whether points are picked on two scans side by side."""
         return bool(self._start.value == PICKED and self._view.value == SIDE_BY_SIDE)
 
-    def _refresh(self) -> None:
+    def _draw_choice(self, labels: dict[str, str]) -> None:
         """Update inputs and notes for the current choice, and request the clouds."""
-        with self._lock:
-            snapshot, session = self._snapshot, self._session
-            scans, start = self._list_chosen(), self._start.value
-            names = [scan.name for scan in scans]
-            self._versions = {
-                scan.name: (scan.figures.points, scan.figures.model, session.restriction(scan.name))
-                for scan in session.scans
-                if scan.cloud != "absent"
-            }
-            labels = scan_labels(session)
-            self._draw_start(scans, labels)
-            chosen = {name: self._versions[name] for name in names}
-            self._picker.offer(chosen, self._reference.value, labels, start == PICKED)
-            ready = len(names) > 1 and (start != PICKED or self._picker.is_ready)
-            self._merge.label = f"Merge {len(names)} scans"
-            self._merge.disabled = snapshot.is_busy or not ready
-            # those of the merge, else those to merge
-            listed = session.merge.record.scans if session.merge else names
-            shown = [
-                scan
-                for scan in session.scans
-                if scan.name in self._versions and scan.name in listed
-            ]
-            editable = self._view.value not in MERGED and not self._is_picking
-            self._editing.offer(shown if editable else [])
-            self._show_layers()
-            if not self._is_picking:
-                self._request_clouds([name for name in listed if name in self._versions], labels)
+        session = self.session
+        scans, start = self._list_chosen(), self._start.value
+        names = [scan.name for scan in scans]
+        self._versions = {
+            scan.name: (scan.figures.points, scan.figures.model, session.restriction(scan.name))
+            for scan in session.scans
+            if scan.cloud != "absent"
+        }
+        self._draw_start(scans, labels)
+        chosen = {name: self._versions[name] for name in names}
+        self._picker.offer(chosen, self._reference.value, labels, start == PICKED)
+        ready = len(names) > 1 and (start != PICKED or self._picker.is_ready)
+        self._merge.label = f"Merge {len(names)} scans"
+        self._merge.disabled = self.snapshot.is_busy or not ready
+        # those of the merge, else those to merge
+        listed = session.merge.record.scans if session.merge else names
+        shown = [
+            scan for scan in session.scans if scan.name in self._versions and scan.name in listed
+        ]
+        editable = self._view.value not in MERGED and not self._is_picking
+        self._editing.offer(shown if editable else [])
+        self._show_layers()
+        if not self._is_picking:
+            self._request_clouds([name for name in listed if name in self._versions], labels)
 
     def _draw_start(self, scans: list[ScanView], labels: dict[str, str]) -> None:
         """Show the angles or the note of the chosen initial alignment."""
@@ -233,10 +215,10 @@ class MergePanel(StepPanel):
 
     def _request_clouds(self, shown: list[str], labels: dict[str, str]) -> None:
         """Request the clouds of the chosen view: the merged surface, or these scans."""
-        merge, view, context = self._session.merge, self._view.value, self._context
+        merge, view, context = self.session.merge, self._view.value, self.context
         poses = (
             {n: np.array(p.T_reference_scan) for n, p in merge.record.pairs.items()}
-            if merge is not None and view == AFTER
+            if merge and view == AFTER
             else {}
         )
         key = (
@@ -248,16 +230,16 @@ class MergePanel(StepPanel):
 
         def make() -> ColouredClouds:
             """Load and colour the merged surface or the scans."""
-            if merge is not None and view in MERGED:
+            if merge and view in MERGED:
                 titles = [labels.get(name, name) for name in merge.record.scans]
                 return colour_merge(context.session, merge.name, view, titles)
             return colour_scans(context.session, shown, poses, labels)
 
-        self.painter.request("clouds", key, make, self._draw_clouds)
+        self.painter.request(self._draw_clouds, key, make)
 
     def _redraw(self) -> None:
         """Draw the clouds again, as other points of them are hidden."""
-        if self._clouds is not None:
+        if self._clouds:
             self._draw_clouds(self._clouds)
 
     def _draw_clouds(self, clouds: ColouredClouds) -> None:
@@ -268,9 +250,8 @@ class MergePanel(StepPanel):
         shown = self._editing.set_scans(scans) or [points for points, _ in clouds.clouds.values()]
         for points, (name, (_, painted)) in zip(shown, clouds.clouds.items(), strict=True):
             self.layer.cloud(f"cloud {name}", points, painted, SHOWN)
-        with self._lock:
-            self._clouds = clouds
-            self._show_layers()
+        self._clouds = clouds
+        self._show_layers()
 
     def _show_layers(self) -> None:
         """Show the clouds, or the two scans to pick on, with their legend."""
@@ -282,7 +263,7 @@ class MergePanel(StepPanel):
         self._picker.show(self._visible and picking)
         self._editing.show(shown)
         self._legend.set("" if picking or self._clouds is None else self._clouds.legend)
-        if shown and self._clouds is not None:
+        if shown and self._clouds:
             self.show_points(self._clouds.view, self._clouds.points)
 
     def _request_merge(self) -> None:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import cv2
@@ -10,11 +11,11 @@ import viser
 
 from slviewer.calibration.next_pose import GOAL_POSES, Coverage
 from slviewer.gui.capture_inputs import ImportInputs
-from slviewer.gui.panel import NO_SESSION, Choice, RestoreButton, Setting, StepPanel
-from slviewer.gui.preview import LiveImage
+from slviewer.gui.panel import RestoreButton, StepPanel
 from slviewer.gui.scene import GHOST, Colour
 from slviewer.gui.widgets import (
     Html,
+    LiveImage,
     Sound,
     Text,
     Tone,
@@ -112,47 +113,52 @@ class PosesPanel(StepPanel):
     _dragged = _sent = 0.0
     _ghost_px: np.ndarray | None = None
     _world: np.ndarray | None = None
-    _target = _latest = ""
+    _target = ""
 
     def build(self) -> None:
         """Create the live image, the buttons, the coverage and the list of poses."""
-        gui, context, operator = self._gui, self._context, self._operator
-        self._world_layer = self._scene.layer("board")
-        self.layers.append(self._world_layer)
+        gui, operator = self._gui, self._operator
+        self._world_layer = self._scene.layer("poses/simulated board")
         self._T_board_centre = np.eye(4)  # mm; the board's handle is at its centre
         self._states: dict[str, str] = {}
         self._drawn_poses: dict[str, Any] = {}
         self._picture = LiveImage(gui)
         self._countdown = Text(gui)
         self._other_object = Text(gui)
-        self._place = context.button(
+        self._place = self.button(
             "Place board", operator.place_at_suggestion, "target-arrow", "cyan",
             hint="Moves the simulated board to the suggested pose",
         )  # fmt: skip
-        self._capture = context.button(
+        self._capture = self.button(
             "Capture pose", operator.capture_pose, "camera", None, hint="Key: C"
         )
         self._hotkey = gui.add_command(
             "Capture pose", hotkey="C", icon=viser.Icon.CAMERA, disabled=True
         )
-        self._hotkey.on_trigger(context.callback(operator.capture_pose))
-        hands_free = gui.add_checkbox(
-            "Hands-free", False, hint="Captures whenever the board is held still"
+        self.react(self._hotkey.on_trigger, operator.capture_pose)
+        self._hands_free = self.setting(
+            self.checkbox("Hands-free", "Captures whenever the board is held still"),
+            operator.set_hands_free,
         )
-        self._hands_free = Setting(context, hands_free, operator.set_hands_free)
         self._accuracy = Text(gui)
-        wanted = gui.add_number(
-            "Sigma, mm", 0.0, min=0.0, max=10.0, step=0.001,
-            hint="Goal: predicted 3D standard deviation at which no further pose is suggested; "
-            "0: the default",
-        )  # fmt: skip
-        self._wanted = Setting(
-            context, wanted, lambda sigma: operator.set_wanted_sigma(float(sigma) or None)
+        self._wanted = self.setting(
+            self.number(
+                "Sigma, mm",
+                0.0,
+                0.0,
+                10.0,
+                0.001,
+                (
+                    "Goal: predicted 3D standard deviation at which no further pose is suggested; "
+                    "0: the default"
+                ),
+            ),
+            lambda sigma: operator.set_wanted_sigma(float(sigma) or None),
         )
         self._coverage = Text(gui)
         with gui.add_folder("Captured poses"):
             self._table = Text(gui)
-            self._chosen = Choice(context, "Pose", self._draw_choice)
+            self._chosen = self.choice("Pose")
             self._detail = Text(gui)
             self._actions = {
                 "Exclude": operator.exclude,
@@ -160,19 +166,18 @@ class PosesPanel(StepPanel):
                 "Retake": operator.retake_pose,
                 "Delete": operator.delete,
             }
-            actions = gui.add_button_group("Action", tuple(self._actions))
-            actions.on_click(context.callback(lambda: self._request_action(actions.value)))
-            self._restore = RestoreButton(context)
+            self.button_group("Action", tuple(self._actions), self._request_action)
+            self._restore = RestoreButton(self)
         ImportInputs(self, "calibration")
         self._sound = Sound(gui)
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Show the poses, coverage and suggestion of a snapshot."""
-        session = snapshot.session or NO_SESSION
+    def draw(self) -> None:
+        """Show the poses, coverage and suggestion."""
+        snapshot, session = self.snapshot, self.session
         if session.target != self._target:
             self._target = session.target
             self._board = Board.parse(self._target) if self._target else None
-            if self._board is not None:
+            if self._board:
                 self._T_board_centre[:3, 3] = self._board.outline().mean(axis=0)
             self._world = None
         self._capture.disabled = snapshot.rig.state != "open" or self._board is None
@@ -180,22 +185,21 @@ class PosesPanel(StepPanel):
         self._place.disabled = session.suggestion is None or session.pending_plan is not None
         self._hands_free.update(snapshot.hands_free)
         self._draw_world(snapshot)
-        if session is self._drawn_session:
-            return
-        self._drawn_session = session
+        if session is not self._drawn_session:
+            self._drawn_session = session
+            self._draw_session(session)
+        self._draw_choice()
+
+    def _draw_session(self, session: SessionView) -> None:
+        """Show the poses and what they cover, and choose the newest one."""
         poses = session.poses
         self._coverage.set(coverage_chart(session.coverage) if session.coverage else "")
         self._draw_accuracy(session)
         self._draw_ghost(session)
-        self._play_sound(poses, snapshot.hands_free)
-        latest = poses[-1].name if poses else ""
-        self._chosen.offer_names(pose.name for pose in reversed(poses))
-        if latest and latest != self._latest:
-            self._chosen.choose(latest)
-        self._latest = latest
+        self._play_sound(poses, self.snapshot.hands_free)
+        self._chosen.offer_names((pose.name for pose in reversed(poses)), follow=True)
         self._table.set(pose_table(poses))
         self._restore.offer(session.deleted_poses)
-        self._draw_choice()
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image with the detected board, and the countdown of a hands-free
@@ -220,9 +224,9 @@ class PosesPanel(StepPanel):
     def _draw_accuracy(self, session: SessionView) -> None:
         """Show the predicted standard deviation and the goal."""
         plan, text = session.plan, ""
-        if plan is not None:
+        if plan:
             self._wanted.update(round(session.wanted_mm, 3))
-        if plan is not None and plan.sigma_mm is not None:
+        if plan and plan.sigma_mm is not None:
             text = f"Predicted sigma {plan.sigma_mm:.3f} mm, goal {session.wanted_mm:.3f} mm"
             if session.enough:
                 text += ": reached."
@@ -263,8 +267,8 @@ class PosesPanel(StepPanel):
 
     def _draw_choice(self) -> None:
         """Show the details of the chosen pose, and all poses in 3D."""
-        self._draw_boards(self._session.poses, self._snapshot.rig.camera)
-        pose = self._snapshot.pose(self._chosen.value)
+        self._draw_boards(self.session.poses, self.snapshot.rig.camera)
+        pose = self.snapshot.pose(self._chosen.value)
         if pose is None:
             self._detail.set("")
             return
@@ -274,7 +278,7 @@ class PosesPanel(StepPanel):
         ]
         if pose.why:
             lines.append(to_html(pose.why))
-        if pose.rms_px is not None:
+        if pose.rms_px:
             camera, projector = pose.rms_px
             rms = f"Reprojection RMS: camera {camera:.3f} px, projector {projector:.3f} px"
             lines.append(to_html(rms))
@@ -297,7 +301,7 @@ class PosesPanel(StepPanel):
             del self._drawn_poses[name]
         for name, pose in known.items():
             T, is_chosen = pose.T_camera_board, name == chosen
-            assert T is not None and board is not None
+            assert T is not None and board
             key = (pose.state, T.tobytes(), bool(pose.thumbnail), is_chosen, str(board))
             if self._drawn_poses.get(name) != key:
                 self._drawn_poses[name] = key
@@ -307,7 +311,7 @@ class PosesPanel(StepPanel):
                     name, T, board.outline(), colour, width, picture=image, label=label
                 )
                 if picture is not None:
-                    picture.on_click(lambda _event, name=name: self._chosen.choose(name))
+                    self.react(picture.on_click, partial(self._chosen.choose, name))
 
     def _play_sound(self, poses: tuple[PoseView, ...], hands_free: bool) -> None:
         """Play a sound for the result of the last pose, as the operator is looking at the board."""
@@ -330,7 +334,7 @@ class PosesPanel(StepPanel):
         if name := self._chosen.value:
             self._actions[action](name)
         else:
-            self._context.notify("info", "Capture a pose first.")
+            self.context.notify("info", "Capture a pose first.")
 
     def _drag_board(self, T_camera_centre: np.ndarray) -> None:
         """Move the simulated board while its handle is dragged, at most every `_DRAG_S`."""
@@ -350,7 +354,7 @@ def pose_table(poses: Sequence[PoseView]) -> Html:
         return note("None yet.")
     rows = []
     for pose in reversed(poses):
-        rms = f"{pose.rms_px[0]:.2f} / {pose.rms_px[1]:.2f} px" if pose.rms_px is not None else ""
+        rms = f"{pose.rms_px[0]:.2f} / {pose.rms_px[1]:.2f} px" if pose.rms_px else ""
         state = coloured(pose.state, _STATES[pose.state][0], bold=True)
         why = f'<div style="color:var(--mantine-color-dimmed)">{to_html(pose.why or rms)}</div>'
         rows.append(

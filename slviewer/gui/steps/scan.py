@@ -10,13 +10,13 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.gui.capture_inputs import ExposureInputs, ImportInputs, SimulatedObject, TurnInputs
 from slviewer.gui.live import LiveScreen
-from slviewer.gui.panel import Choice, RestoreButton, Setting, StepPanel, display_name, scan_options
+from slviewer.gui.panel import RestoreButton, StepPanel, display_name, scan_options
 from slviewer.gui.point_editing import PointEditing, RegionInputs
-from slviewer.gui.preview import LiveImage
 from slviewer.gui.scene import Click
 from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
 from slviewer.gui.widgets import (
     Html,
+    LiveImage,
     Text,
     Tone,
     alert,
@@ -40,7 +40,7 @@ from slviewer.wizard.result_views import (
     used_points,
     whole_cloud,
 )
-from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView, Snapshot
+from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView
 
 SMALL_PX = 380
 """Width of the live image: the cloud matters more here."""
@@ -59,39 +59,39 @@ class ScanPanel(StepPanel):
     _known: tuple[str, ...] = ()
     _placed: tuple[str, ...] | None = None
     _loaded: tuple[Any, ScanCloud] | None = None
-    _cloud: ScanCloud | None = None
-    _whole: ScanCloud | None = None
-    _redraws = 0
-    _is_live = False
+    _made: tuple[ScanCloud, ScanCloud, str, str] | None = None
+    """The cloud that is drawn, what is used of it, its colours, and why nothing is used."""
 
     def build(self) -> None:
         """Create the inputs of capture, live scan, gallery and cloud."""
-        gui, context, operator = self._gui, self._context, self._operator
-        self._screen = LiveScreen(context)
+        gui, operator = self._gui, self._operator
+        self._screen = LiveScreen(self.context)
         operator.subscribe_live(self._screen.offer)
         with gui.add_folder("Capture") as self._capture_folder:
             self._picture = LiveImage(gui, "Live image", width_px=SMALL_PX)
-            self._capture = context.button(
+            self._capture = self.button(
                 "Capture scan", lambda: operator.capture_scan(label.value), "camera", None
             )
-            patterns = gui.add_dropdown(
-                "Patterns",
-                tuple(PRESETS),
-                hint="micro for concave metal, wax and other surfaces that light themselves",
+            self._patterns = self.setting(
+                self.dropdown(
+                    "Patterns",
+                    PRESETS,
+                    "micro for concave metal, wax and other surfaces that light themselves",
+                ),
+                operator.choose_patterns,
             )
-            self._patterns = Setting(context, patterns, operator.choose_patterns)
             ExposureInputs(self, for_scan=True)
-            align = gui.add_checkbox(
-                "Align as you scan",
-                False,
-                hint="Shows each new scan in its place beside those before it",
+            self._align = self.setting(
+                self.checkbox(
+                    "Align as you scan", "Shows each new scan in its place beside those before it"
+                ),
+                operator.set_align_scans,
             )
-            self._align = Setting(context, align, operator.set_align_scans)
             label = gui.add_text("Name", "", hint="Optional; numbered by default")
-            self._live = context.button(
+            self._live = self.button(
                 "Live", self._toggle_live, "player-play", "teal", hint=LIVE_HINT
             )
-            self._save = context.button(
+            self._save = self.button(
                 "Save cloud", lambda: operator.save_live(label.value), "download", "green"
             )
             self._live_status = Text(gui)
@@ -100,53 +100,52 @@ class ScanPanel(StepPanel):
             SimulatedObject(self, *things)
         self._gallery = Text(gui)
         with gui.add_folder("Cloud") as self._cloud_folder:
-            self._scan = scan = Choice(context, "Scan", self._refresh)
+            self._scan = scan = self.choice("Scan")
             self._figures = Text(gui)
-            self._model = Choice(context, "Model")
-            self._reconstruct = context.button(
+            self._model = self.choice("Model")
+            self._reconstruct = self.button(
                 "Reconstruct",
                 lambda: operator.reconstruct(scan.value, self._model.value or None),
                 "cube",
                 None,
             )
             self._placement = Text(gui)
-            self._place = context.button("Align scan", lambda: operator.align(scan.value), "puzzle")
-            self._take_out = context.button(
+            self._place = self.button("Align scan", lambda: operator.align(scan.value), "puzzle")
+            self._take_out = self.button(
                 "Undo alignment", lambda: operator.undo_alignment(scan.value), "arrow-back-up"
             )
-            self._support = context.button(
+            self._support = self.button(
                 "Remove support", lambda: operator.remove_support(*self._shown_scans()),
                 "table-minus",
                 hint="Deletes the plane that the object stands on, and all below it; "
                 "Undo edit brings it back",
             )  # fmt: skip
-            self._view = Choice(context, "3D view", self._refresh)
-            self._colour = gui.add_dropdown("Colour", COLOURS)
-            context.on_change(self._refresh, self._colour)
+            self._view = self.choice("3D view")
+            self._colour = self.dropdown("Colour", COLOURS)
             self._legend = Text(gui)
-            context.view_button(self.get_points)
+            self.view_button()
             self._point = Text(gui)
             self._region = RegionInputs(self)
             self._editing = PointEditing(self, self._redraw, self._show_point)
             name = gui.add_text("New name", "")
-            context.button("Rename scan", lambda: operator.rename(scan.value, name.value), "pencil")
-            context.button(
+            self.button("Rename scan", lambda: operator.rename(scan.value, name.value), "pencil")
+            self.button(
                 "Delete scan", lambda: operator.delete(scan.value), "trash", "red",
                 hint="Moves it to the session's trash",
             )  # fmt: skip
-        self._restore = RestoreButton(context)
+        self._restore = RestoreButton(self)
         ImportInputs(self, "scan")
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Show the scans and the live scan of a snapshot."""
-        session, calibration = self._session, snapshot.calibration
+    def draw(self) -> None:
+        """Show the live scan, the scans, and the cloud of the chosen one."""
+        snapshot, session, calibration = self.snapshot, self.session, self.session.calibration
         rig = snapshot.rig
-        ready = rig.is_idle and snapshot.step(self.key).state != "blocked"
+        ready = rig.is_idle and not self.is_blocked
         self._capture_folder.visible = rig.state != "none"
         self._capture.disabled = not ready
         self._draw_live(snapshot.live, ready)
         self._patterns.handle.disabled = not rig.is_idle
-        if snapshot.session is not None:
+        if snapshot.session:
             self._patterns.update(session.patterns)
         self._restore.offer(session.deleted_scans)
         self._align.update(session.aligns_scans)
@@ -163,11 +162,11 @@ class ScanPanel(StepPanel):
             if self._known:  # show what was just reconstructed
                 self._scan.choose(new[0])
             self._known = tuple(reconstructed)
-        if calibration is not None:
+        if calibration:
             self._model.offer_names(calibration.models, calibration.best)
         else:
             self._model.offer_names(())
-        self._refresh()
+        self._draw_scan(next(scan for scan in scans if scan.name == self._scan.value))
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image."""
@@ -190,11 +189,15 @@ class ScanPanel(StepPanel):
         button.disabled = live is None and not ready
         save.visible, save.disabled = live is not None, live is None or not live.clouds_per_s
         self._live_status.set("" if live is None else live_html(live, self._screen.points))
-        if live is None and self._is_live:
-            self._screen.clear()
-        self._is_live = live is not None
-        if self._is_live:
+        if live:
             self._clear_cloud()
+        else:
+            self._screen.clear()
+
+    @property
+    def _is_live(self) -> bool:
+        """Whether a live scan runs."""
+        return self.snapshot.live is not None
 
     def _toggle_live(self) -> None:
         """Start the live scan, or stop it where it runs."""
@@ -205,14 +208,15 @@ class ScanPanel(StepPanel):
 
     def _clear_cloud(self) -> None:
         """Remove the captured cloud with its legend and picked point."""
-        self.painter.cancel("cloud")
+        self.painter.cancel(self._draw_cloud)
+        self.painter.cancel(self._draw_aligned)
         self._forget_cloud()
         self.layer.remove("cloud")
         self._legend.set("")
 
     def _forget_cloud(self) -> None:
         """Forget the captured cloud and its picked point, as others are shown."""
-        self._cloud = self._whole = self._shown = None
+        self._made = self._shown = None
         self._editing.set_scans([])
         self._forget_point()
 
@@ -221,46 +225,40 @@ class ScanPanel(StepPanel):
         self.layer.remove("picked")
         self._point.set("")
 
-    def _refresh(self) -> None:
-        """Request the chosen cloud in the chosen colours."""
-        with self._lock:
-            snapshot, session = self._snapshot, self._session
-            scan = snapshot.scan(self._scan.value)
-            if scan is None:
-                return
-            is_absent, busy = scan.cloud == "absent", snapshot.is_busy
-            self._reconstruct.disabled = busy
-            self._reconstruct.label = "Reconstruct" if is_absent else "Reconstruct again"
-            self._figures.set(scan_html(scan))
-            self._region.offer(session, "" if is_absent else scan.name)
-            self._editing.offer([scan])
-            self._place.visible = scan.cloud == "fresh" and not scan.is_placed
-            self._take_out.visible = scan.is_placed
-            self._place.disabled = self._take_out.disabled = busy
-            # where it is among the others, or why it is kept apart
-            text = f"{scan.label}: {scan.placement.summary()}" if scan.placement else ""
-            self._placement.set(note(text, "good" if scan.is_placed else "warning"))
-            shown = len(self._shown_scans())
-            suffix = "" if shown == 1 else f", {shown} scans"
-            self._support.label = f"Remove support{suffix}"
-            self._support.disabled = busy or is_absent or shape_of(scan) != "scan"
-            self._gallery.set(gallery(sort_scans(session.scans), scan.name))
-            if self._is_live:
-                return
-            if self._view.value == ALIGNED:
-                placed = tuple(
-                    (each.name, each.figures.model) for each in session.scans if each.is_placed
-                )
-                self.painter.request(
-                    "cloud",
-                    (ALIGNED, placed),
-                    lambda: aligned_scans(self._context.session),
-                    self._draw_aligned,
-                )
-            elif is_absent:
-                self._clear_cloud()
-            else:
-                self._request_cloud(session, scan)
+    def _draw_scan(self, scan: ScanView) -> None:
+        """Show the chosen scan, and request its cloud in the chosen colours."""
+        is_absent, busy = scan.cloud == "absent", self.snapshot.is_busy
+        self._reconstruct.disabled = busy
+        self._reconstruct.label = "Reconstruct" if is_absent else "Reconstruct again"
+        self._figures.set(scan_html(scan))
+        self._region.offer("" if is_absent else scan.name)
+        self._editing.offer([scan])
+        self._place.visible = scan.cloud == "fresh" and not scan.is_placed
+        self._take_out.visible = scan.is_placed
+        self._place.disabled = self._take_out.disabled = busy
+        # where it is among the others, or why it is kept apart
+        text = f"{scan.label}: {scan.placement.summary()}" if scan.placement else ""
+        self._placement.set(note(text, "good" if scan.is_placed else "warning"))
+        shown = len(self._shown_scans())
+        suffix = "" if shown == 1 else f", {shown} scans"
+        self._support.label = f"Remove support{suffix}"
+        self._support.disabled = busy or is_absent or shape_of(scan) != "scan"
+        self._gallery.set(gallery(sort_scans(self.session.scans), scan.name))
+        if self._is_live:
+            return
+        if self._view.value == ALIGNED:
+            placed = [each for each in self.session.scans if each.is_placed]
+            self.painter.request(
+                self._draw_aligned,
+                tuple((each.name, each.figures.model) for each in placed),
+                lambda: aligned_scans(self.context.session),
+            )
+            self.painter.cancel(self._draw_cloud)
+        elif is_absent:
+            self._clear_cloud()
+        else:
+            self._request_cloud(self.session, scan)
+            self.painter.cancel(self._draw_aligned)
 
     def _request_cloud(self, session: SessionView, scan: ScanView) -> None:
         """Request the cloud of a reconstructed scan in the chosen colours."""
@@ -273,28 +271,28 @@ class ScanPanel(StepPanel):
             """Load the cloud, unless it is loaded already; returns it, what is used of it, the
             chosen colours, and why nothing is used."""
             if self._loaded is None or self._loaded[0] != key:
-                self._loaded = key, whole_cloud(self._context.session, scan.name)
+                self._loaded = key, whole_cloud(self.context.session, scan.name)
             whole = self._loaded[1]
             try:
-                return whole, used_points(self._context.session, whole), colour, ""
+                return whole, used_points(self.context.session, whole), colour, ""
             except InputError as error:  # all is shown, so that the region can be put around it
                 return whole, whole, colour, str(error)
 
         used = session.restriction(scan.name)
-        self.painter.request("cloud", (key, used, self._redraws, colour), make, self._draw_cloud)
+        self.painter.request(self._draw_cloud, (key, used, colour), make)
 
     def _shown_scans(self) -> tuple[str, ...]:
         """Return the names of the scans in the 3D view: those in place, or the chosen one."""
         if self._view.value == ALIGNED:
-            return tuple(scan.name for scan in self._session.scans if scan.is_placed)
+            return tuple(scan.name for scan in self.session.scans if scan.is_placed)
         return (self._scan.value,)
 
     def _offer_views(self, scans: Sequence[ScanView]) -> None:
         """Offer to view the aligned scans together, and do so when another one came to its
         place."""
         placed = tuple(sorted(scan.name for scan in scans if scan.is_placed))
-        together = [(ALIGNED, f"{len(placed)} scans in place")] if len(placed) > 1 else []
-        self._view.offer([(ONE, "this scan"), *together], ONE)
+        together = {f"{len(placed)} scans in place": ALIGNED} if len(placed) > 1 else {}
+        self._view.offer({"this scan": ONE} | together, ONE)
         if together and self._placed is not None and set(placed) - set(self._placed):
             self._view.choose(ALIGNED)
         self._placed = placed
@@ -309,22 +307,21 @@ class ScanPanel(StepPanel):
         painted = (painted * (0.35 + 0.65 * np.clip(aligned.facing, 0, 1))[:, None]).astype(
             np.uint8
         )
-        self.layer.cloud("cloud", aligned.points, painted)
         self._legend.set(aligned_html(aligned))
-        self.show_points(ALIGNED, aligned.points)
+        self.show_cloud(ALIGNED, aligned.points, painted)
 
     def _redraw(self) -> None:
         """Draw the cloud again, as other points of it are hidden."""
-        self._redraws += 1
-        self._refresh()
+        if self._made:
+            self._draw_cloud(self._made)
 
     def _draw_cloud(self, made: tuple[ScanCloud, ScanCloud, str, str]) -> None:
         """Draw what is used of a loaded cloud in the chosen colours, unless a live scan runs."""
         whole, cloud, colour, why = made
         if self._is_live:
             return
-        is_new = whole is not self._whole
-        self._whole, self._cloud = whole, cloud
+        is_new = self._made is None or whole is not self._made[0]
+        self._made = made
         painted, bar = paint_cloud(cloud, colour)
         (points,) = self._editing.set_scans([(cloud, cloud.points)])
         shown = self.layer.cloud("cloud", points, painted)
@@ -338,15 +335,12 @@ class ScanPanel(StepPanel):
 
     def _show_point(self, click: Click) -> None:
         """Show the values of the point closest to the clicked ray."""
-        cloud = self._cloud
-        pixel = None if cloud is None else cloud.nearest(click.origin, click.direction)
-        if cloud is None or pixel is None:
-            return
-        u, v = pixel
-        self._point.set(point_html(cloud, u, v))
-        self.layer.mark(
-            "picked", cloud.points[v, u], f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm"
-        )
+        cloud = self._made and self._made[1]
+        if cloud and (pixel := cloud.nearest(click.origin, click.direction)):
+            u, v = pixel
+            self._point.set(point_html(cloud, u, v))
+            text = f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm"
+            self.layer.mark("picked", cloud.points[v, u], text)
 
 
 def aligned_html(aligned: AlignedScans) -> Html:

@@ -4,15 +4,14 @@ capture."""
 from functools import partial
 
 from slviewer.gui.capture_inputs import SimulatedObject
-from slviewer.gui.panel import Choice, StepPanel, display_name, scan_options
-from slviewer.gui.preview import LiveImage
-from slviewer.gui.widgets import PLOT_PX, Plot, Text, colour_bar, colours, records_html
-from slviewer.pipeline.stored_records import load_arrays
+from slviewer.gui.panel import StepPanel, display_name, scan_options
+from slviewer.gui.widgets import PLOT_PX, LiveImage, Plot, Text, colour_bar, colours, records_html
+from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
 from slviewer.report.page import Figure
 from slviewer.wizard import result_views
-from slviewer.wizard.snapshot import PreviewView, ScanView, Snapshot
+from slviewer.wizard.snapshot import PreviewView, ScanView
 
 _ICONS: dict[Shape, str] = {"plane": "square", "sphere": "sphere"}
 SMALL_PX = 300
@@ -27,59 +26,54 @@ class VerifyPanel(StepPanel):
 
     key = "verify"
 
-    _measured: tuple[str, ...] = ()
-
     def build(self) -> None:
         """Create the inputs of capture, results and recorded captures."""
-        gui, context, operator = self._gui, self._context, self._operator
+        gui, operator = self._gui, self._operator
         self._waiting: dict[Shape, list[str]] = {}
         with gui.add_folder("Capture") as self._capture_folder:
             self._picture = LiveImage(gui, "Live image", width_px=SMALL_PX)
             self._captures = [
-                context.button(
+                self.button(
                     "Capture plane", lambda: operator.capture_plane(label.value), "square", None
                 ),
-                context.button(
+                self.button(
                     "Capture sphere", lambda: operator.capture_sphere(label.value), "sphere", None
                 ),
             ]
             label = gui.add_text("Name", "", hint="Optional; numbered by default")
             SimulatedObject(self, *_ICONS)
         with gui.add_folder("Result") as self._result_folder:
-            self._result = Choice(context, "Result", self._refresh)
+            self._result = self.choice("Result")
             self._figures = Text(gui)
             self._maps = Plot(gui)
-            self._model = Choice(
-                context, "3D colours", self._refresh, hint="The model whose errors colour the cloud"
-            )
+            self._model = self.choice("3D colours", "The model whose errors colour the cloud")
             self._legend = Text(gui)
-            context.view_button(self.get_points)
+            self.view_button()
         with gui.add_folder("All results") as self._table_folder:
             self._table = Text(gui)
-            context.button("Write CSV", lambda: operator.export("table"), "table-export")
+            self.button("Write CSV", lambda: operator.export("table"), "table-export")
             self._file = Text(gui)
         with gui.add_folder("Recorded captures") as self._recorded_folder:
-            self._recorded = Choice(context, "Capture")
-            self._radius = gui.add_number(
+            self._recorded = self.choice("Capture")
+            self._radius = self.number(
                 "Radius, mm",
                 0.0,
-                min=0.0,
-                max=2000.0,
+                0.0,
+                2000.0,
                 hint="Approximate radius of a sphere, to detect it; 0: unknown",
             )
             for shape, icon in _ICONS.items():
-                context.button(f"Measure {shape}", partial(self._request, shape), icon)
+                self.button(f"Measure {shape}", partial(self._request, shape), icon)
             self._all = {
-                shape: context.button(
+                shape: self.button(
                     f"Measure all {shape}s", partial(self._request, shape, every=True), icon
                 )
                 for shape, icon in _ICONS.items()
             }
 
-    def draw(self, snapshot: Snapshot) -> None:
-        """Show the verifications of a snapshot."""
-        session, rig = self._session, snapshot.rig
-        ready = snapshot.step(self.key).state != "blocked"
+    def draw(self) -> None:
+        """Show the verifications, and the chosen one."""
+        session, rig, ready = self.session, self.snapshot.rig, not self.is_blocked
         self._capture_folder.visible = rig.state != "none"
         for button in self._captures:
             button.disabled = not (ready and rig.is_idle)
@@ -91,25 +85,25 @@ class VerifyPanel(StepPanel):
         # those without an up-to-date verification first
         measured = {row.name for row in rows if not row.stale}
         waiting = [scan for scan in session.scans if scan.name not in measured]
-        options = [
-            (name, f"{text}, measured")
-            for name, text in scan_options(session.scans)
-            if name in measured
-        ]
-        self._recorded.offer(scan_options(waiting) + options)
+        self._recorded.offer(
+            scan_options(waiting)
+            | {
+                f"{text}, measured": name
+                for text, name in scan_options(session.scans).items()
+                if name in measured
+            }
+        )
         for shape, button in self._all.items():
             self._waiting[shape] = [scan.name for scan in waiting if shape_of(scan) == shape]
             n = len(self._waiting[shape])
             button.visible, button.label = n > 0, f"Measure all {n} {shape}s"
-        labels = {row.name: row.label for row in rows}
-        self._result.offer((name, display_name(name, label)) for name, label in labels.items())
-        if new := [name for name in labels if name not in self._measured]:
-            if self._measured:  # show what was just measured
-                self._result.choose(new[-1])
-            self._measured = tuple(labels)
+        results = {row.name: row for row in rows}
+        titles = {display_name(row.name, row.label): row.name for row in rows}
+        self._result.offer(titles, follow=True)  # to what was just measured
         self._table.set(records_html(rows))
-        self._file.set(self._context.links_html(session.exports, TABLE))
-        self._refresh()
+        self._file.set(self.context.links_html(session.exports, TABLE))
+        if rows:
+            self._draw_result(results[self._result.value])
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image."""
@@ -117,44 +111,34 @@ class VerifyPanel(StepPanel):
 
     # drawing
 
-    def _refresh(self) -> None:
-        """Request the error maps and the cloud of the chosen result."""
-        with self._lock:
-            name = self._result.value
-            found = self._session.list_records(Verification)
-            view = next((each for each in found if each.name == name), None)
-            if view is None:
-                return
-            models, shape = list(view.record.models), view.record.shape
-            self._model.offer_names(models, models[-1])
-            self._figures.set(records_html([view], named=False))
-            context, key = self._context, (name, view.record.summary())
+    def _draw_result(self, chosen: Stored[Verification]) -> None:
+        """Show a result, and request its error maps and its cloud."""
+        context, name, record = self.context, chosen.name, chosen.record
+        self._model.offer_names(record.models, [*record.models][-1])
+        self._figures.set(records_html([chosen], named=False))
+        key = (name, record.summary())
 
-            def draw_maps() -> Figure:
-                """Draw the error maps of the capture by model."""
-                arrays = load_arrays(context.session, f"{Verification.kind}/{name}")
-                title = display_name(name, view.label)
-                return verification_maps(title, view.record, arrays, PLOT_PX)
+        def draw_maps() -> Figure:
+            """Draw the error maps of the capture by model."""
+            arrays = load_arrays(context.session, f"{Verification.kind}/{name}")
+            return verification_maps(display_name(name, chosen.label), record, arrays, PLOT_PX)
 
-            self.painter.request("maps", key, draw_maps, self._maps.set)
-            model = self._model.value
-            self.painter.request(
-                "cloud",
-                (key, model),
-                lambda: (result_views.whole_cloud(context.session, name), model, shape),
-                self._draw_cloud,
-            )
+        self.painter.request(self._maps.set, key, draw_maps)
+        model = self._model.value
+        self.painter.request(
+            self._draw_cloud,
+            (key, model),
+            lambda: (result_views.whole_cloud(context.session, name), model, record.shape),
+        )
 
     def _draw_cloud(self, made: tuple[result_views.ScanCloud, str, Shape]) -> None:
         """Draw a cloud coloured by the error of a model, with its legend."""
         cloud, model, shape = made
         limit = error_limit(list(cloud.errors.values()))
-        self.layer.cloud(
-            "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error")
-        )
+        painted = colours(cloud.errors[model], -limit, limit, "error")
+        self.show_cloud(cloud.name, cloud.points, painted)
         title = f"error of {model}; {SIGN[shape]}; grey: not evaluated"
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
-        self.show_points(cloud.name, cloud.points)
 
     # requests
 
