@@ -26,7 +26,7 @@ from slviewer.examination.findings import (
 )
 from slviewer.examination.ghost import has_ghost
 from slviewer.examination.light import equalize_samples, estimate_light
-from slviewer.examination.motion import measure_motion
+from slviewer.examination.motion import is_displaced, measure_motion
 from slviewer.examination.sample import sample_capture
 from slviewer.fringe.aliased_harmonics import MOST_STEPS, estimate_aliased_harmonics
 from slviewer.fringe.decoding_task import prepare_decoding
@@ -105,9 +105,12 @@ def _is_moving_still(
     evaluator: Evaluator, found: Explanation, motion: Mapping[Axis, float]
 ) -> bool:
     """Return whether the steps are displaced also where an explanation is true, which accounts only
-    for a part of what motion does then, or where it is a frame that shows no pattern."""
+    for a part of what motion does then, or where it is a frame that shows no other pattern."""
     for hypothesis in found:
-        if hypothesis.cause == "duplicate-frame" and hypothesis.value is None:
+        is_strange = hypothesis.cause == "duplicate-frame" and hypothesis.value is None
+        if is_strange and is_displaced(
+            evaluator, described(hypothesis.sequence), *hypothesis.frames
+        ):
             return True
         own = {a: px for a, px in motion.items() if hypothesis.axis in (a, None)}
         left = measure_motion(evaluator, _fill_in(hypothesis))

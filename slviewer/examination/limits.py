@@ -111,10 +111,10 @@ OUTSIDE, OUTSIDE_OF_CODE = 0.08, 0.02
 that wrong bits of a Gray code do not."""
 LEAST_MOTION = 0.015
 """Displacement from the first to the last step, in periods, that gamma and noise do not imitate."""
-JUMP_SHARE, JUMP_SIGMAS, MOST_JUMP = 0.7, 10.0, 0.2
-"""The same of a displacement between two steps: its share of the steps' variance, its standard
-errors, and periods that a step which shows another pattern exceeds. Measured, steps of a long
-period of sound captures jump by at most 6 standard errors with that share."""
+JUMP_SHARE, JUMP_EXPLAINS, JUMP_SIGMAS, MOST_JUMP = 0.7, 0.5, 10.0, 0.2
+"""The same of a displacement between two steps: its share of the steps' variance, and of the
+residual of the displaced steps; its standard errors, and periods that a step which shows another
+pattern exceeds. Measured, long periods of sound captures jump by at most 6 standard errors."""
 MUCH_MOTION = 0.03
 """The same, from which a capture must not be measured: a fringe is read to a hundredth."""
 USUAL_OFFSET = 0.02

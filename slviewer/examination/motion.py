@@ -1,5 +1,8 @@
 """Motion of the scene during a capture, from the displacement of the pattern in each phase step."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 
 from slviewer.examination import limits
@@ -11,47 +14,87 @@ def measure_motion(evaluator: Evaluator, base: Hypothesis) -> dict[Axis, float]:
     """Return the displacement of the patterns during the phase steps of each axis in which it is
     significant, px of the projector: steady, from the first to the last step, or all at once.
 
-    The coordinate that predicts a pixel is the mean over its steps; each step is displaced from it
-    by residual / slope. Light that varies displaces no step, and a step that shows another pattern
-    displaces one, by more than a jump may have.
+    Light that varies displaces no step, and a step that shows another pattern displaces one, by
+    more than a jump may have.
     """
     out = dict[Axis, float]()
+    for axis, steps in _measure_steps(evaluator, base):
+        period, every = base.sequence.periods_px(axis)[-1], np.arange(len(steps.shift))
+        steady = _fit_shape(steps, every / len(every))
+        if _is_clear(steady, limits.SIGMAS, period):
+            out[axis] = steady[0]
+        jumps = [(*_fit_shape(steps, every >= k), k) for k in every[1:]]
+        jump = max(jumps, key=lambda fitted: fitted[2])
+        displaced = every >= jump[3]
+        if steps.weight[displaced].sum() > steps.weight.sum() / 2:
+            displaced = ~displaced
+        is_jump = jump[2] > max(limits.JUMP_SHARE, steady[2])
+        is_jump &= abs(jump[0]) < limits.MOST_JUMP * period
+        is_jump &= steps.explains(displaced)
+        if is_jump and _is_clear(jump[:3], limits.JUMP_SIGMAS, period):
+            out[axis] = jump[0]
+    return out
+
+
+def is_displaced(evaluator: Evaluator, base: Hypothesis, image: int) -> bool:
+    """Return whether a displacement explains what an image shows instead of its phase step."""
+    return any(
+        image in steps.images and steps.explains(steps.images == image)
+        for _, steps in _measure_steps(evaluator, base)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Displacements of the k phase steps of an axis in the order of their ``images`` (k,).
+
+    ``shift`` (k,): px of the projector; ``weight`` (k,): inverse of its variance; ``explained``,
+    ``whole`` (k,): squared residual that the shift explains, and all of it.
+    """
+
+    images: np.ndarray
+    shift: np.ndarray
+    weight: np.ndarray
+    explained: np.ndarray
+    whole: np.ndarray
+
+    def explains(self, steps: np.ndarray) -> bool:
+        """Return whether displacement explains most of what some steps, (k,) bool, leave."""
+        least = limits.JUMP_EXPLAINS * self.whole[steps].sum()
+        return bool(self.explained[steps].sum() > least)
+
+
+def _measure_steps(evaluator: Evaluator, base: Hypothesis) -> Iterator[tuple[Axis, _Steps]]:
+    """Yield the displacements of the phase steps of each axis that has four at least.
+
+    The coordinate that predicts a pixel is the mean over its steps; each step is displaced from it
+    by residual / slope.
+    """
     for axis, sample, m, good in evaluator.explained(base):
         atoms = evaluator.atoms(base, axis)
         steps = np.flatnonzero(atoms.groups[m.places] >= 0)
         if len(steps) < 4:
             continue
-        steps = steps[np.argsort(np.array(m.images)[steps])]
+        images = np.array(m.images)[steps]
+        steps = steps[order := np.argsort(images)]
         slope = atoms.slope_at(m.coordinate[good])[m.places][steps]
         residual = (m.residual(sample)[:, good] / m.contrast[good])[steps]
-        squares, moment = (np.einsum("kp,kp->k", a, slope) for a in (slope, residual))
-        shift = -moment / squares
-        weight = squares / np.mean(residual**2, axis=1)
-        period = base.sequence.periods_px(axis)[-1]
-        steady = _fit_shape(shift, weight, np.arange(len(steps)) / len(steps))
-        if _is_clear(steady, limits.SIGMAS, period):
-            out[axis] = steady[0]
-        jumps = [
-            _fit_shape(shift, weight, np.arange(len(steps)) >= k) for k in range(1, len(steps))
-        ]
-        jump = max(jumps, key=lambda fitted: fitted[2])
-        is_jump = (
-            jump[2] > max(limits.JUMP_SHARE, steady[2]) and abs(jump[0]) < limits.MOST_JUMP * period
+        squares, moment, whole = (
+            np.einsum("kp,kp->k", a, b)
+            for a, b in ((slope, slope), (residual, slope), (residual, residual))
         )
-        if is_jump and _is_clear(jump, limits.JUMP_SIGMAS, period):
-            out[axis] = jump[0]
-    return out
+        weight = squares / whole * residual.shape[1]
+        yield axis, _Steps(images[order], -moment / squares, weight, moment**2 / squares, whole)
 
 
-def _fit_shape(
-    shift: np.ndarray, weight: np.ndarray, shape: np.ndarray
-) -> tuple[float, float, float]:
-    """Fit displacements (k,) by a multiple of a shape (k,) and a constant: the multiple, its
-    standard error, and the share of the displacements' weighted variance that it explains."""
+def _fit_shape(steps: _Steps, shape: np.ndarray) -> tuple[float, float, float]:
+    """Fit displacements by a multiple of a shape (k,) and a constant: the multiple, its standard
+    error, and the share of the displacements' weighted variance that it explains."""
+    weight = steps.weight
     centred = shape - np.average(shape, weights=weight)
     information = float(weight @ centred**2)
-    multiple = float((weight * centred) @ shift) / information
-    variance = float(weight @ (shift - np.average(shift, weights=weight)) ** 2)
+    multiple = float((weight * centred) @ steps.shift) / information
+    variance = float(weight @ (steps.shift - np.average(steps.shift, weights=weight)) ** 2)
     return multiple, information**-0.5, multiple**2 * information / variance
 
 
