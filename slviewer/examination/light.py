@@ -89,7 +89,9 @@ def _accept(
     is_refuted |= claimed > 3 * before + limits.CONFIRMED_LEAST
     is_refuted |= "wave" in light.terms and not _shows_wave(sequence, stack, light)
     is_strange = np.abs(np.log(light.gain)).max() > limits.FARTHEST_GAIN
-    if is_strange or (is_refuted and score > limits.EXPLAINED_CLEARLY):
+    # means that differ anyway, of few fringes in view, refute nothing that explains much
+    is_final = before < limits.CONFIRMED_LEAST or score > limits.EXPLAINED_CLEARLY
+    if is_strange or (is_refuted and is_final):
         return constant
     is_confirmed = before > limits.CONFIRMED_LEAST and after < limits.CONFIRMED * before
     if is_confirmed or score < limits.EXPLAINED_BY_LIGHT:
