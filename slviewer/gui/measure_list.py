@@ -43,7 +43,7 @@ from slviewer.records.measurement import Measurement, list_quantities
 from slviewer.report.canvas import finish_figure, new_figure, style_axes
 from slviewer.report.page import Figure
 from slviewer.report.surfaces import draw_deviations, section_plot
-from slviewer.wizard.measure_requests import PLAN, TABLE
+from slviewer.wizard.result_requests import PLAN, TABLE
 from slviewer.wizard.snapshot import SessionView
 
 CHOSEN, OTHER, STALE = (200, 40, 40), (30, 90, 160), (140, 140, 140)

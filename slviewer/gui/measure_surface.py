@@ -14,8 +14,8 @@ from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviati
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.measurement import Measurement
+from slviewer.wizard.result_views import place_at
 from slviewer.wizard.snapshot import SessionView
-from slviewer.wizard.surfaces import place_at
 
 COLOURS = ("texture", "depth", "uncertainty")
 DEVIATION = "deviation"

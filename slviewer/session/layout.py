@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from slviewer import __version__
 from slviewer.errors import DamagedError, SessionError
-from slviewer.session.atomic import disk_errors, replace_json
+from slviewer.session.atomic import disk_errors, replace_file, to_json
 from slviewer.session.reading import expand_user, read_json
 
 _IS_WINDOWS = sys.platform == "win32"
@@ -28,13 +28,13 @@ do not read."""
 
 def is_session(path: str | Path) -> bool:
     """Whether a session, readable or not, is in this folder."""
-    return (_absolute_path(path) / "session.json").is_file()
+    return (expand_user(path) / "session.json").is_file()
 
 
 def session_folder(path: str | Path) -> Path:
     """The absolute folder of an existing session; SessionError where it is missing, damaged or
     newer."""
-    folder = _absolute_path(path)
+    folder = expand_user(path).absolute()
     if not is_session(folder):
         raise SessionError(
             f"{folder} is not a session folder (it holds no session.json): give the folder of a"
@@ -56,7 +56,7 @@ def session_folder(path: str | Path) -> Path:
 def new_folder(path: str | Path) -> tuple[Path, bool]:
     """A folder that a session may be made in, and whether it was made here, else empty;
     SessionError otherwise."""
-    folder = _absolute_path(path)
+    folder = expand_user(path).absolute()
     if _IS_WINDOWS and len(str(folder)) > _LONGEST_FOLDER:
         raise SessionError(
             f"the path of the session has {len(str(folder))} characters, and Windows allows 259 for"
@@ -86,17 +86,15 @@ def create_layout(folder: Path) -> None:
         for inner in ("captures", "results"):
             (folder / inner).mkdir(exist_ok=True)
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    replace_json(
-        folder / "session.json",
-        {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"},
-    )
+    described = {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"}
+    replace_file(folder / "session.json", to_json(described))
 
 
 def raise_schema(folder: Path) -> None:
     """State the newest schema in an older session, before anything is saved that needs it."""
     described = read_json(folder / "session.json")
     if described["schema"] < SCHEMA:
-        replace_json(folder / "session.json", {**described, "schema": SCHEMA})
+        replace_file(folder / "session.json", to_json({**described, "schema": SCHEMA}))
 
 
 def remove_layout(folder: Path) -> bool:
@@ -139,11 +137,6 @@ def _is_leftover(entry: Path) -> bool:
     return entry.name in (".lock", ".lock-holder", ".DS_Store") or entry.name.startswith(
         ".session.json.tmp-"
     )
-
-
-def _absolute_path(path: str | Path) -> Path:
-    """Return an absolute path, with "~" expanded."""
-    return expand_user(path).absolute()
 
 
 _TIME = "%Y%m%dT%H%M%S%f"

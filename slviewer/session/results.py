@@ -10,10 +10,11 @@ import io
 import math
 import os
 import tokenize
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, TypedDict, TypeVar
 
 import google_crc32c
 import msgspec
@@ -24,11 +25,19 @@ from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain
 from slviewer.records.record import Count, Vector
 from slviewer.records.verdict import Examination
-from slviewer.session.atomic import to_json, write_bytes, write_synced_json
+from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.layout import inner_folders
 from slviewer.session.names import safe_path
-from slviewer.session.reading import decoding, open_regular, read_file, read_json
+from slviewer.session.reading import (
+    MOST_REMEMBERED,
+    decoding,
+    identify,
+    open_regular,
+    read_file,
+    read_json,
+)
 
+T = TypeVar("T")
 Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
 Size = tuple[Extent, Extent]
 _Matrix3 = tuple[Vector, Vector, Vector]
@@ -228,6 +237,13 @@ def check_result(
     return checked
 
 
+def in_threads(function: Callable[..., T], *arguments: Iterable[Any]) -> list[T]:
+    """Return what a function returns for each of the arguments, as `map` does: moving and hashing
+    files releases the interpreter, and more than four threads only queue for the disk."""
+    with ThreadPoolExecutor(4) as pool:
+        return list(pool.map(function, *arguments))
+
+
 def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write a checked result into an empty folder, every file synced. Its hash covers meta and
     arrays."""
@@ -244,21 +260,25 @@ def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.
         return whole.digest(), _checksum(header, array)
 
     names = sorted(arrays)
-    with ThreadPoolExecutor(4) as pool:
-        digests = dict(zip(names, pool.map(write, names), strict=True))
+    digests = dict(zip(names, in_threads(write, names), strict=True))
     content_hash = _combine_digests(meta, {name: digest for name, (digest, _) in digests.items()})
     checksums = {name: checksum for name, (_, checksum) in digests.items()}
-    write_synced_json(
-        folder / "meta.json",
-        {**meta, "hash": content_hash, "arrays": names, "checksums": checksums},
-    )
+    saved = {**meta, "hash": content_hash, "arrays": names, "checksums": checksums}
+    write_bytes(folder / "meta.json", to_json(saved))
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
-    """`meta` as it was saved, with its content `hash` and the names and checksums of its `arrays`.
+    """`meta` as it was saved, with its content `hash` and the names and checksums of its `arrays`;
+    not to be changed, as it is read once.
 
     Raises DamagedError where these, or its `inputs`, are not what the session writes.
     """
+    return _read_meta(folder, identify(folder / "meta.json"))
+
+
+@lru_cache(MOST_REMEMBERED)
+def _read_meta(folder: Path, identity: object) -> dict[str, Any]:
+    """Read `meta`, as `read_meta` does."""
     meta = read_json(folder / "meta.json")
     with decoding(folder / "meta.json"):
         check_meta("/".join(folder.parts[-2:]), meta)

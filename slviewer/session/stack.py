@@ -11,7 +11,6 @@ import hashlib
 import os
 import sys
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,11 +23,8 @@ from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import write_bytes
 from slviewer.session.reading import decoding, read_json
-from slviewer.session.results import Extent
+from slviewer.session.results import Extent, in_threads
 
-_THREADS = (
-    4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
-)
 _SEPARATOR = "."
 """Between the parts of a chunk's name: with Zarr's default, "/", every frame has two folders to be
 synced too."""
@@ -51,18 +47,16 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
         write_bytes(_chunk_path(path, _SEPARATOR, index), frame.data, _checksum(frame))
         return _digest(frame)
 
-    with ThreadPoolExecutor(_THREADS) as pool:
-        digests = list(pool.map(write, range(len(frames))))
+    digests = in_threads(write, range(len(frames)))
     return _combine_digests(frames.shape, frames.dtype, digests)
 
 
 def hash_frames(frames: np.ndarray) -> str:
     """Return the content hash that frames (n, h, w), uint8 or uint16, have once they are
     written."""
-    with ThreadPoolExecutor(_THREADS) as pool:
-        digests = list(
-            pool.map(lambda frame: _digest(_to_little_endian(np.ascontiguousarray(frame))), frames)
-        )
+    digests = in_threads(
+        lambda frame: _digest(_to_little_endian(np.ascontiguousarray(frame))), frames
+    )
     return _combine_digests(frames.shape, frames.dtype, digests)
 
 
@@ -119,8 +113,7 @@ class FrameStack:
         for index in wanted:  # before memory is allocated for what the description announces
             self._check_size(index)
         frames = np.empty((len(wanted), *self.shape[1:]), self.dtype)
-        with ThreadPoolExecutor(_THREADS) as pool:
-            list(pool.map(self._read_frame, wanted, frames))
+        in_threads(self._read_frame, wanted, frames)
         return frames if sys.byteorder == "little" else frames.byteswap(inplace=True)
 
     def hash(self) -> tuple[str, list[str]]:
@@ -134,8 +127,7 @@ class FrameStack:
             self._read_frame(index, frame)
             return _digest(frame)
 
-        with ThreadPoolExecutor(_THREADS) as pool:
-            digests = list(pool.map(digest, range(self.shape[0])))
+        digests = in_threads(digest, range(self.shape[0]))
         return _combine_digests(self.shape, self.dtype, digests), [each.hex() for each in digests]
 
     def identify(self) -> tuple[tuple[int, ...], ...]:

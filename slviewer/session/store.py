@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar, get_args
 
@@ -408,7 +408,7 @@ class Session(Decisions):
         if self._together is None:
             atomic.move(folder, target)
         else:
-            self._together.move_away(folder, target)
+            self._together.replace(folder, None, target)
         return target
 
     def deleted_results(self) -> list[str]:
@@ -471,7 +471,7 @@ class Session(Decisions):
 
     # decisions and exports
 
-    def exclude(self, name: str, why: str) -> None:
+    def exclude(self, name: str, why: str = "by hand") -> None:
         """Exclude a capture from calibrations from now on, with the reason."""
         self.load_capture(name)
         self._decide("excluded", lambda: {**self.excluded(), name: why})
@@ -484,16 +484,19 @@ class Session(Decisions):
             folder.mkdir(exist_ok=True)
         return folder
 
+    def staged_export(self, name: str) -> AbstractContextManager[Path]:
+        """Context manager: as `staged_file`, of a file in the exports."""
+        return self.staged_file(self.exports / safe_name(name))
+
     @contextmanager
-    def staged_export(self, name: str) -> Iterator[Path]:
-        """Context manager: a path for a file that goes to the exports at the end, unless that fails
+    def staged_file(self, target: Path, needs_bytes: int = 0) -> Iterator[Path]:
+        """Context manager: a path for a file that goes to its place at the end, unless that fails
         or is given up."""
-        target = self.exports / safe_name(name)
-        with atomic.staged_folder(target, 0) as folder:
-            yield folder / name
+        with atomic.staged_folder(target, needs_bytes) as folder:
+            yield folder / target.name
             if self._allow is not None:
                 self._allow()
-            atomic.rename(folder / name, target)
+            atomic.rename(folder / target.name, target)
         atomic.discard(folder)
 
     # inside

@@ -31,7 +31,7 @@ from slviewer.simulation.turning import STEPS, turning
 from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import Row, median, row, run_python
 from slviewer.validation.rendered_calibration import observe_rendered, scan_sequence
-from slviewer.wizard.planner import Planner
+from slviewer.wizard.pose_plan import Planner
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import RigView
 

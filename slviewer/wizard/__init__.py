@@ -13,7 +13,7 @@ threads do the work.
 `jobs`                one worker that computes, one job after the other; each can be cancelled
                       within a second
 `session_reader`      reads poses, calibration and records from the session's files
-`planner`             computes where the board should be held next
+`pose_plan`           computes where the board should be held next
 `steps`               the nine steps, and what each is waiting for
 `snapshot`            what a panel draws; `publisher` builds and publishes it
 `autopilot`           runs the whole wizard on the simulated rig, by the same requests

@@ -11,7 +11,6 @@ import numpy as np
 from slviewer.devices.world import Thing
 from slviewer.errors import Cancelled, SlviewerError
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
@@ -83,7 +82,7 @@ class Autopilot:
             self._verify()
             self._scan()
             self._measure()
-            self._perform_act("Writing the report", self._operator.report)
+            self._perform_act("Writing the report", self._operator.export, "report")
         finally:
             self._operator.set_autopilot_status("")
 
@@ -137,9 +136,18 @@ class Autopilot:
         """Measure the sphere's radius and the object's width."""
         operator = self._operator
         sphere, latest = self._list_scans("sphere")[-1], self._list_scans("scan")[-1]
-        region = _make_ball_region(operator.surface(sphere))
+        on = operator.surface(sphere)
+        # a ball around the point nearest to the camera, its radius half the measured extent
+        z = np.where(on.measured, on.points[..., 2], np.inf)
+        top = on.points[np.unravel_index(int(np.argmin(z)), z.shape)]
+        away = np.linalg.norm(on.points[on.measured] - top, axis=-1)
+        region = Region.ball(top, 0.5 * float(np.percentile(away, 95)))
         self._perform_act("Measuring the sphere", operator.measure, sphere, "sphere", region=region)
-        ends = _select_width_ends(operator.surface(latest))
+        # the ends of the row of the image with the most measured points
+        measured = operator.surface(latest).measured
+        v = int(np.argmax(measured.sum(axis=1)))
+        columns = np.flatnonzero(measured[v])
+        ends = (int(columns[0]), v), (int(columns[-1]), v)
         self._perform_act(
             "Measuring the width of the object", operator.measure, latest, "distance", ends
         )
@@ -192,18 +200,3 @@ class Autopilot:
             except SlviewerError:
                 if time.monotonic() > end:
                     raise
-
-
-def _make_ball_region(on: MeasuredSurface) -> Region:
-    """Return a ball around the point nearest to the camera, its radius half the measured extent."""
-    z = np.where(on.measured, on.points[..., 2], np.inf)
-    top = on.points[np.unravel_index(int(np.argmin(z)), z.shape)]
-    away = np.linalg.norm(on.points[on.measured] - top, axis=-1)
-    return Region.ball(top, 0.5 * float(np.percentile(away, 95)))
-
-
-def _select_width_ends(on: MeasuredSurface) -> tuple[Place, Place]:
-    """Return the two end pixels (u, v) of the image row with the most measured points."""
-    v = int(np.argmax(on.measured.sum(axis=1)))
-    columns = np.flatnonzero(on.measured[v])
-    return (int(columns[0]), v), (int(columns[-1]), v)

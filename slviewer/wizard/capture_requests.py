@@ -4,7 +4,6 @@ made: what is projected, the name under which it is saved, and what follows."""
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +17,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.capture import check_space, depth_axis, save_frames
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.import_captures import Role, describe_import, import_captures
+from slviewer.pipeline.operation import Job
 from slviewer.pipeline.turn import (
     FULL_TURN_DEG,
     STEPS,
@@ -32,12 +32,10 @@ from slviewer.pipeline.turn import (
 from slviewer.session import atomic
 from slviewer.session.capture import TurnStep
 from slviewer.session.importers.archive import unpack, unpacked_size
-from slviewer.session.names import new_name
+from slviewer.session.names import new_name, plain_name
 from slviewer.session.reading import expand_user
-from slviewer.session.store import Session
 from slviewer.wizard.acquisition import CaptureRequest
 from slviewer.wizard.engine import request
-from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.result_requests import ResultRequests
 from slviewer.wizard.rig_requests import RigRequests
@@ -98,41 +96,48 @@ class CaptureRequests(RigRequests, ResultRequests):
         def save(captured: CapturedFrames) -> None:
             """Save the captured frames as a target pose; a retaken pose is included again."""
             save_frames(store, name, "pose", captured, board=target, force=retake)
-            if retake and name in store.excluded():
+            if retake:
                 store.include(name)
+            self._queue_processing()
 
         self._queue_capture(name, self._pose_sequence(), save)
 
     def _capture_scan(self, purpose: Purpose, label: str, follow: Callable[[str], object]) -> None:
         """Queue the capture of a scan, plane or sphere; `follow(name)` is called once it is
         saved."""
-        store, sequence, name = self._store, self._scan_sequence(), self._next_name(purpose)
+        sequence, name = self._scan_sequence(), self._next_name(purpose)
 
         def save(captured: CapturedFrames) -> None:
-            """Save the captured frames as a scan, with the operator's label."""
-            save_frames(store, name, purpose, captured)
-            if label.strip():
-                self._set_label(name, label)
+            """Save the captured frames as a scan, and follow up."""
+            self._save_scan(name, purpose, captured, label)
+            follow(name)
 
-        self._queue_capture(name, sequence, save, follow)
+        self._queue_capture(name, sequence, save)
 
-    def _queue_capture(
+    def _save_scan(
         self,
         name: str,
-        sequence: PatternSequence,
-        save: Callable[[CapturedFrames], None],
-        follow: Callable[[str], object] = lambda name: None,
+        purpose: Purpose,
+        captured: CapturedFrames,
+        label: str = "",
+        turn_step: TurnStep | None = None,
     ) -> None:
-        """Queue a capture; `follow(name)` is called once it is saved. Raises SessionError where the
-        disk is too full."""
+        """Save captured frames as a scan with the operator's label, and queue its processing."""
+        save_frames(self._store, name, purpose, captured, turn_step=turn_step)
+        if label.strip():
+            self._set_label(name, label)
+        self._queue_processing()
+
+    def _queue_capture(
+        self, name: str, sequence: PatternSequence, save: Callable[[CapturedFrames], None]
+    ) -> None:
+        """Queue a capture. Raises SessionError where the disk is too full."""
         reel, exposures = self._require_bench().reel, self._reader.exposures_ms()
         self._check_space(name, len(sequence.frames) * max(1, len(exposures)))
 
-        def saved() -> None:
-            """Queue the processing of the saved capture, call `follow`, and advance a replayed
-            recording."""
-            self._queue_processing()
-            follow(name)
+        def finish(captured: CapturedFrames) -> None:
+            """Save the capture, and advance a replayed recording."""
+            save(captured)
             self._note_change()
             if reel:
                 # the next recording may lack these
@@ -140,7 +145,7 @@ class CaptureRequests(RigRequests, ResultRequests):
                     self._acquisition.set_light("white")
                 reel.advance()
 
-        self._acquisition.capture(CaptureRequest(name, sequence, save, saved, exposures))
+        self._acquisition.capture(CaptureRequest(name, sequence, finish, exposures))
 
     def _check_space(self, name: str, frames: int) -> None:
         """Raise SessionError where the disk has no room for so many frames."""
@@ -193,10 +198,7 @@ class CaptureRequests(RigRequests, ResultRequests):
         self._check_space(name, len(shot.frames))
         source = self._acquisition.view().name
         captured = CapturedFrames(shot.frames, shot.settings, live.stream.sequence, source)
-        save_frames(self._store, name, "scan", captured)
-        if label.strip():
-            self._set_label(name, label)
-        self._queue_processing()
+        self._save_scan(name, "scan", captured, label)
         self._finish_scan(name)
 
     def subscribe_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
@@ -256,8 +258,7 @@ class CaptureRequests(RigRequests, ResultRequests):
                     buffer,
                     lambda done, n: progress(done / n, f"frame {done} of {n}"),
                 )
-                save_frames(store, step.name, "scan", captured, turn_step=step)
-                self._queue_processing()
+                self._save_scan(step.name, "scan", captured, turn_step=step)
                 self._finish_scan(step.name)
 
             capture_turn(rig, steps, capture_step, recorded, progress, self._warner("scans"))
@@ -284,14 +285,11 @@ class CaptureRequests(RigRequests, ResultRequests):
             raise InputError(
                 "no folder is named: enter the path of a folder on the computer that runs slviewer"
             )
-        store = self._store
-
-        def work(report: Reporter) -> list[str]:
-            """Import the folder's captures; returns their names."""
-            guarded = store.guarded(report.saving)
-            return self._import(guarded, expand_user(path), layout, role, report, options)
-
-        self._submit(IMPORTING, work, partial(describe_import, role=role))
+        self._work(
+            IMPORTING,
+            lambda job: self._import(job, expand_user(path), layout, role, options),
+            "frames",
+        )
 
     @request(IMPORTING)
     def import_zip(
@@ -304,50 +302,38 @@ class CaptureRequests(RigRequests, ResultRequests):
     ) -> None:
         """Import the captures in a zip that was uploaded as `name`; images outside of folders
         become one capture of that name."""
-        store = self._store
 
-        def work(report: Reporter) -> list[str]:
-            """Unpack the zip into a temporary folder and import it; returns the names of the
-            captures."""
+        def work(job: Job) -> str:
+            """Unpack the zip into a temporary folder and import it."""
             archive, words = io.BytesIO(content), f"unpacking {name}"
-            report(0.0, words)
-            with atomic.staged_folder(store.folder / UNPACKED, unpacked_size(archive)) as staged:
-                folder = staged / _make_capture_name(Path(name).stem)
+            job.progress(0.0, words)
+            place, size = job.store.folder / UNPACKED, unpacked_size(archive)
+            with atomic.staged_folder(place, size) as staged:
+                folder = staged / new_name(
+                    plain_name(Path(name).stem, "capture").strip("._-") or "capture"
+                )
                 folder.mkdir()
                 try:
-                    unpacking = part(report, 0, 0.2)
+                    unpacking, importing = part(job.progress, 0, 0.2), part(job.progress, 0.2, 1)
                     source, warnings = unpack(archive, folder, lambda done: unpacking(done, words))
                     for warning in warnings:
-                        self._warner("frames")(warning)
-                    guarded, origin = store.guarded(report.saving), {"origin": name, **options}
-                    return self._import(guarded, source, layout, role, part(report, 0.2, 1), origin)
+                        job.warn(warning)
+                    origin = {"origin": name, **options}
+                    return self._import(
+                        replace(job, progress=importing), source, layout, role, origin
+                    )
                 finally:
                     atomic.discard(staged)
 
-        self._submit(IMPORTING, work, partial(describe_import, role=role))
+        self._work(IMPORTING, work, "frames")
 
     def _import(
-        self,
-        store: Session,
-        source: Path,
-        layout: str,
-        role: Role,
-        progress: Progress,
-        options: dict[str, Any],
-    ) -> list[str]:
-        """Import the captures in a folder, and queue their processing; returns their names."""
+        self, job: Job, source: Path, layout: str, role: Role, options: dict[str, Any]
+    ) -> str:
+        """Import the captures in a folder, and queue their processing; returns a sentence about
+        them."""
         names = import_captures(
-            source, store, layout, role=role, progress=progress, warn=self._warner("frames"),
-            **options,
-        )  # fmt: skip
+            source, job.store, layout, role=role, progress=job.progress, warn=job.warn, **options
+        )
         self._queue_processing()
-        return names
-
-
-def _make_capture_name(name: str) -> str:
-    """Return a valid capture name, ASCII and at most 100 characters, made from the name of an
-    upload."""
-    plain = "".join(c if (c.isalnum() and c.isascii()) or c in "_-." else "_" for c in name).strip(
-        "._-"
-    )
-    return new_name(plain[:100] or "capture")
+        return describe_import(names, role=role)

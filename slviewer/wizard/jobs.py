@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from slviewer.errors import Cancelled
-from slviewer.wizard.notices import Notices, log
-from slviewer.wizard.service import Service
+from slviewer.wizard.notices import Notices
+from slviewer.wizard.service import Service, log
 from slviewer.wizard.snapshot import JobView
 
 PATIENCE_S = 0.5
@@ -53,14 +53,10 @@ class Reporter:
         if share < 1:  # with the last report everything is saved
             with self._lock:
                 self._saving = False
-            self.check()
+                if self.cancelled:
+                    raise Cancelled("cancelled")
         self.share, self.stage = min(max(float(share), 0.0), 1.0), stage
         self._changed()
-
-    def check(self) -> None:
-        """Raise Cancelled if the work was cancelled."""
-        if self.cancelled:
-            raise Cancelled("cancelled")
 
     def saving(self) -> None:
         """Mark the start of a save: raises Cancelled, or defers cancelling until the next
@@ -100,11 +96,13 @@ class _Job:
 
 class Jobs(Service):
     """A worker thread with a foreground and a background queue. Every method may be called from any
-    thread."""
+    thread. `ended()` is called after each job, whatever became of it."""
 
-    def __init__(self, notices: Notices, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, notices: Notices, changed: Callable[[], None], ended: Callable[[], None]
+    ) -> None:
         super().__init__("slviewer worker")
-        self._notices, self._changed = notices, changed
+        self._notices, self._changed, self._ended = notices, changed, ended
         self._waiting: list[_Job] = []
         self._running: _Job | None = None
         self._thread.start()
@@ -187,7 +185,7 @@ class Jobs(Service):
             with self._condition:
                 self._running = None
                 self._condition.notify_all()
-            self._changed()
+            self._ended()
             with self._condition:
                 self._condition.wait_for(lambda: self._closing or self._waiting)
                 if self._closing:

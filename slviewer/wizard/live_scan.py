@@ -33,7 +33,7 @@ from slviewer.reconstruction.reconstruct import Model
 from slviewer.session.store import Session
 from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.jobs import release_memory
-from slviewer.wizard.live_frames import LiveCapture, Stream
+from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.live_motion import mask_motion
 from slviewer.wizard.notices import Notices
 from slviewer.wizard.snapshot import LiveView
@@ -173,7 +173,7 @@ class LiveScan:
         released = time.monotonic()
         while (shot := self.stream.wait_next()) is not None:
             try:
-                cloud = self._compute_cloud(shot)
+                points, texture = self._load_model().cloud(shot.frames)
             except Exception as error:
                 self._notices.add_failure("Live", error)
                 self._acquisition.stop_stream()
@@ -181,22 +181,17 @@ class LiveScan:
             now = time.monotonic()
             with self._lock:
                 self._made.append((now, now - shot.begun))
+                self._number += 1
+                self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
             if not self.is_running:
                 return
-            self._publish(cloud)
+            self._publish(LiveCloud(self._number, points, texture, shot.begun))
             if now - self._reported > 1 / REPORTS_PER_S:
                 self._reported = now
                 self._changed()
             if now - released > _RELEASE_S:
                 released = now
                 release_memory()
-
-    def _compute_cloud(self, shot: LiveCapture) -> LiveCloud:
-        """Reconstruct a capture with the current calibration."""
-        points, texture = self._load_model().cloud(shot.frames)
-        self._number += 1
-        self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
-        return LiveCloud(self._number, points, texture, shot.begun)
 
     def _load_model(self) -> LiveModel:
         """Return the model, checked for changes at most a second ago. Raises SlviewerError where

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from datetime import datetime
 
 from slviewer.errors import SlviewerError, hide_passwords
+from slviewer.wizard.service import log
 from slviewer.wizard.snapshot import Level, Notice
-
-log = logging.getLogger("slviewer.wizard")
 
 MOST_NOTICES = 100
 

@@ -7,16 +7,16 @@ callbacks too.
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
 from slviewer.wizard.capture_requests import CaptureRequests
-from slviewer.wizard.engine import Timing, request
-from slviewer.wizard.measure_requests import MeasureRequests
+from slviewer.wizard.engine import request
+from slviewer.wizard.service import Timing
 from slviewer.wizard.snapshot import Level, Notice, PreviewView, Snapshot
-from slviewer.wizard.surfaces import Surfaces
 
 
 class AutopilotLike(Protocol):
@@ -33,7 +33,7 @@ class AutopilotLike(Protocol):
         """Stop sending requests."""
 
 
-class Operator(CaptureRequests, MeasureRequests):
+class Operator(CaptureRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(
@@ -47,7 +47,6 @@ class Operator(CaptureRequests, MeasureRequests):
         """Open or create `session`, with `rig`, by default the one that the session remembers."""
         super().__init__(set_up, self.capture_pose, timing or Timing())
         self._autopilot: AutopilotLike | None = None
-        self._surfaces = Surfaces()
         if session is not None:
             self.open_session(session, rig)
         elif rig is not None:
@@ -80,16 +79,11 @@ class Operator(CaptureRequests, MeasureRequests):
         Returns a function that unsubscribes. A callback must return soon, and must not wait for
         another snapshot.
         """
-        removals = [self._publisher.listeners.add(callback)]
+        unsubscribe = ExitStack()
+        unsubscribe.callback(self._publisher.listeners.add(callback))
         if preview:
-            removals.append(self._preview_listeners.add(preview))
-
-        def stop() -> None:
-            """Remove the callbacks."""
-            for remove in removals:
-                remove()
-
-        return stop
+            unsubscribe.callback(self._preview_listeners.add(preview))
+        return unsubscribe.close
 
     def notices(self) -> tuple[Notice, ...]:
         """Return the latest notices, oldest first, also those that no snapshot shows yet."""

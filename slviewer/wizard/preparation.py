@@ -19,8 +19,8 @@ from llvmlite import binding
 
 from slviewer.geometry.jit_cache import cache_root, hash_sources
 from slviewer.wizard.autopilot import RIG, Autopilot
-from slviewer.wizard.notices import log
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.service import log
 
 SCALE = 0.2
 """Of the rig's resolution: small, and every step still succeeds."""

@@ -5,20 +5,15 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Generic, TypeVar
+from typing import Generic
 
-from slviewer.wizard.notices import describe_failure, log
-from slviewer.wizard.service import Service
+from slviewer.wizard.notices import describe_failure
+from slviewer.wizard.service import Item, Service, log
 from slviewer.wizard.snapshot import Snapshot
 
 PAUSE_S = 0.05
 """Between two snapshots: a panel needs no more than twenty a second."""
 REFRESH_S = 30.0
-RETRY_S = 2.0
-"""After a snapshot that is not the current state, until the next is built although nothing is known
-to have changed."""
-
-Item = TypeVar("Item")
 
 
 class Listeners(Generic[Item]):
@@ -59,7 +54,7 @@ class Publisher(Service):
     """
 
     def __init__(
-        self, build: Callable[[int, bool], Snapshot], first: Snapshot, retry_s: float = RETRY_S
+        self, build: Callable[[int, bool], Snapshot], first: Snapshot, retry_s: float
     ) -> None:
         super().__init__("slviewer publisher")
         self._build, self._retry_s = build, retry_s

@@ -42,11 +42,11 @@ is reported."""
 @dataclass(frozen=True)
 class ExposureChange:
     """Exposures that were suggested and set, and what they replaced: exposure and gain as the
-    session remembers them, None where it did not, and the exposures of each capture, none where it
+    session remembers them, and the exposures of each capture, none where it
     was a single one."""
 
     suggestion: ExposureSuggestion
-    exposure_before: dict[str, float | None] | None
+    exposure_before: dict[str, float | None]
     exposures_before_ms: tuple[float, ...]
 
 
@@ -111,6 +111,11 @@ class RigView:
     turntable: str = ""  # its name; empty: the rig has none
 
     @property
+    def exposure(self) -> dict[str, float | None]:
+        """Its exposure and gain, as the session remembers them."""
+        return {"exposure_ms": self.exposure_ms, "gain": self.gain}
+
+    @property
     def is_idle(self) -> bool:
         """Whether it is open, and nothing is captured."""
         return self.state == "open" and self.capture is None
@@ -123,7 +128,7 @@ class RigView:
 
 @dataclass(frozen=True, eq=False)
 class PoseView:
-    """One target pose. `T_camera_board` (4, 4) mm is exact where `calibrated`, else approximate,
+    """One target pose. `T_camera_board` (4, 4) mm is exact where it is "used", else approximate,
     None if unknown; `rms_px` is (camera, projector) reprojection; `thumbnail` a JPEG, empty until
     made; `board_px` (4, 2) the board's outline in the camera's px.
     """
@@ -133,7 +138,6 @@ class PoseView:
     why: str
     created: str
     T_camera_board: np.ndarray | None
-    calibrated: bool
     board_px: np.ndarray | None
     rms_px: tuple[float, float] | None
     thumbnail: bytes = field(repr=False)
@@ -335,6 +339,7 @@ class Snapshot:
     notices: tuple[Notice, ...] = ()
     steps: tuple[StepView, ...] = ()
     space: Space | None = None
+    brightness: Brightness = ""  # of the camera's image in white light
     hands_free: bool = False
     autopilot: str = ""  # what it does now; empty where it is off
     preflight: Preflight | None = None  # result of the last check of the rig in use

@@ -22,6 +22,7 @@ from slviewer.simulation.rig import letter
 from slviewer.wizard.acquisition import Acquisition, CaptureRequest
 from slviewer.wizard.jobs import Jobs
 from slviewer.wizard.notices import Notices
+from slviewer.wizard.service import Timing
 from slviewer.wizard.snapshot import CaptureProgress, Level
 
 pytestmark = pytest.mark.computes
@@ -54,9 +55,8 @@ class Bench:
             self.notices,
             self._record_progress,
             lambda frame, _: self.previews.append(frame),
-            retry_s=0.1,
-            previews_per_s=50.0,
-            clock=clock,
+            Timing(retry_s=0.1, previews_per_s=50.0),
+            clock,
         )
         self.rig: Rig
         self.faults: Faults
@@ -71,7 +71,6 @@ class Bench:
             name,
             sequence,
             lambda taken: self.saved.append((name, taken.frames.copy(), taken.settings)),
-            lambda: None,
         )
 
     def previews_go_on(self) -> None:
@@ -198,12 +197,9 @@ def test_a_disk_that_refuses_loses_the_capture_but_not_the_rig(bench: Bench) -> 
         raise SessionError("the disk is full: free some space")
 
     bench.open()
-    followed: list[bool] = []
-    bench.acquisition.capture(
-        CaptureRequest("pose_01", SEQUENCE, save, lambda: followed.append(True))
-    )
+    bench.acquisition.capture(CaptureRequest("pose_01", SEQUENCE, save))
     until(lambda: bool(bench.texts))
-    assert bench.texts == ["pose_01: the disk is full: free some space"] and followed == []
+    assert bench.texts == ["pose_01: the disk is full: free some space"]
     assert bench.acquisition.view().state == "open"
     bench.previews_go_on()
 
@@ -234,7 +230,7 @@ def test_a_capture_can_be_cancelled(bench: Bench) -> None:
 
 def test_previews_go_on_while_the_worker_is_busy(bench: Bench) -> None:
     bench.open()
-    jobs = Jobs(bench.notices, lambda: None)
+    jobs = Jobs(bench.notices, lambda: None, lambda: None)
     end = threading.Event()
     jobs.submit("Busy", lambda report: end.wait(HANG_S))
     bench.previews_go_on()

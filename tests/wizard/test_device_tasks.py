@@ -125,7 +125,6 @@ def test_a_capture_in_several_exposures_is_saved_whole(bench: Bench, tmp_path: P
                 "pose_01",
                 SEQUENCE,
                 lambda taken: save_frames(store, "pose_01", "pose", taken),
-                lambda: None,
                 (4.0, 0.5),
             )
         )
@@ -145,9 +144,7 @@ def test_a_fault_while_exposures_change_leaves_no_capture_and_the_old_exposure(
     bench.open()
     bench.faults.plan("unplugged", 5)
     request = bench.request("broken")
-    bench.acquisition.capture(
-        CaptureRequest("broken", SEQUENCE, request.save, lambda: None, (0.5, 4.0))
-    )
+    bench.acquisition.capture(CaptureRequest("broken", SEQUENCE, request.save, (0.5, 4.0)))
     until(lambda: len(bench.texts) >= 2)
     assert missing_facts(bench.texts[0], "discarded") == [] and bench.levels == ["error", "good"]
     assert bench.saved == []
@@ -164,7 +161,6 @@ def test_a_colour_camera_leaves_its_texture_in_the_session(bench: Bench, tmp_pat
                 "scan_01",
                 SEQUENCE,
                 lambda taken: save_frames(store, "scan_01", "scan", taken),
-                lambda: None,
             )
         )
         until(lambda: bench.acquisition.idle and bool(store.capture_names()))

@@ -19,8 +19,8 @@ from slviewer.records.measurement import Measurement
 from slviewer.report.canvas import round_up
 from slviewer.session.nominal import MM
 from slviewer.surface.selection import ViewCamera
+from slviewer.wizard.result_views import box_in_view, point_at
 from slviewer.wizard.snapshot import SessionView, Snapshot
-from slviewer.wizard.surfaces import box_in_view, point_at
 
 UNKNOWN = "unknown"
 BALL, RECTANGLE, BOX = "ball", "rectangle", "box"

@@ -30,16 +30,11 @@ from slviewer.gui.widgets import (
     thumbnail,
     to_html,
 )
+from slviewer.pipeline.align import AlignedScans, view_aligned
 from slviewer.records.verification import Verification
 from slviewer.report.maps import error_limit
 from slviewer.simulation.concave import CONCAVE
-from slviewer.wizard.result_views import (
-    AlignedScans,
-    ScanCloud,
-    aligned_scans,
-    used_points,
-    whole_cloud,
-)
+from slviewer.wizard.result_views import ScanCloud, used_points, whole_cloud
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView, Snapshot
 
 SMALL_PX = 380
@@ -254,7 +249,7 @@ class ScanPanel(StepPanel):
                 self.painter.request(
                     "cloud",
                     (ALIGNED, placed),
-                    lambda: aligned_scans(self._context.session),
+                    lambda: view_aligned(self._context.session),
                     self._draw_aligned,
                 )
             elif is_absent:
