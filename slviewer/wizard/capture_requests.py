@@ -54,9 +54,7 @@ class CaptureRequests(RigRequests, ResultRequests):
     @request("Capturing the pose")
     def capture_pose(self) -> None:
         """Capture the board where it is; its features are evaluated in the background."""
-        # first: a capture that fails is not repeated with every preview
-        self._hands_free.note_capture()
-        self._capture_pose(self._next_name("pose"), retake=False)
+        self._capture_pose()
 
     @request("Retaking the pose")
     def retake_pose(self, name: str) -> None:
@@ -64,55 +62,54 @@ class CaptureRequests(RigRequests, ResultRequests):
         saved."""
         if self._store.load_capture(name).role != "calibration":
             raise InputError(f"{name} is not a target pose: capture another scan instead")
-        self._hands_free.note_capture()
-        self._capture_pose(name, retake=True)
+        self._capture_pose(name)
 
     @request("Capturing the scan")
     def capture_scan(self, label: str = "") -> None:
         """Capture an object and reconstruct it; `label` is the operator's name for it, any text."""
-        self._capture_scan("scan", label, self._finish_scan)
+        self._capture_scan("scan", label)
 
     @request("Capturing the plane")
     def capture_plane(self, label: str = "") -> None:
         """Capture a flat plate and compare the models on it."""
-        self._capture_scan("plane", label, lambda name: self.verify([name], "plane"))
+        self._capture_scan("plane", label)
 
     @request("Capturing the sphere")
     def capture_sphere(self, label: str = "") -> None:
         """Capture a sphere and compare the models on it."""
-        self._capture_scan("sphere", label, lambda name: self.verify([name], "sphere"))
+        self._capture_scan("sphere", label)
 
     @request("Switching hands-free capture")
     def set_hands_free(self, on: bool) -> None:
         """Capture a pose whenever the board is held still in a new place."""
         self._hands_free.is_on = on
 
-    def _capture_pose(self, name: str, retake: bool) -> None:
-        """Queue the capture of a target pose; `retake` replaces the one of that name."""
+    def _capture_pose(self, retaken: str = "") -> None:
+        """Queue the capture of a target pose, in place of the one that is retaken."""
+        # first: a capture that fails is not repeated with every preview
+        self._hands_free.note_capture()
         store, target = self._store, self._reader.target()
+        name = retaken or self._next_name("pose")
         if not target:
             raise InputError("choose the target first: a pose is judged by it")
 
         def save(captured: CapturedFrames) -> None:
             """Save the captured frames as a target pose; a retaken pose is included again."""
-            save_frames(store, name, "pose", captured, board=target, force=retake)
-            if retake:
+            save_frames(store, name, "pose", captured, board=target, force=bool(retaken))
+            if retaken:
                 store.include(name)
             self._queue_processing()
 
         self._queue_capture(name, self._pose_sequence(), save)
 
-    def _capture_scan(self, purpose: Purpose, label: str, follow: Callable[[str], object]) -> None:
-        """Queue the capture of a scan, plane or sphere; `follow(name)` is called once it is
-        saved."""
-        sequence, name = self._scan_sequence(), self._next_name(purpose)
-
-        def save(captured: CapturedFrames) -> None:
-            """Save the captured frames as a scan, and follow up."""
-            self._save_scan(name, purpose, captured, label)
-            follow(name)
-
-        self._queue_capture(name, sequence, save)
+    def _capture_scan(self, purpose: Purpose, label: str) -> None:
+        """Queue the capture of a scan, plane or sphere."""
+        name = self._next_name(purpose)
+        self._queue_capture(
+            name,
+            self._scan_sequence(),
+            lambda captured: self._save_scan(name, purpose, captured, label),
+        )
 
     def _save_scan(
         self,
@@ -122,11 +119,18 @@ class CaptureRequests(RigRequests, ResultRequests):
         label: str = "",
         turn_step: TurnStep | None = None,
     ) -> None:
-        """Save captured frames as a scan with the operator's label, and queue its processing."""
+        """Save captured frames with the operator's label; reconstruct a scan, and align it where
+        that is wanted, or compare the models on a plane or a sphere."""
         save_frames(self._store, name, purpose, captured, turn_step=turn_step)
         if label.strip():
             self._set_label(name, label)
         self._queue_processing()
+        if purpose != "scan":
+            self.verify([name], purpose)
+            return
+        self.reconstruct(name)
+        if self._store.decision("align_scans"):
+            self.align(name)
 
     def _queue_capture(
         self, name: str, sequence: PatternSequence, save: Callable[[CapturedFrames], None]
@@ -199,7 +203,6 @@ class CaptureRequests(RigRequests, ResultRequests):
         source = self._acquisition.view().name
         captured = CapturedFrames(shot.frames, shot.settings, live.stream.sequence, source)
         self._save_scan(name, "scan", captured, label)
-        self._finish_scan(name)
 
     def subscribe_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
         """Call back with every live cloud, on the live scan's thread; returns a function that
@@ -259,7 +262,6 @@ class CaptureRequests(RigRequests, ResultRequests):
                     lambda done, n: progress(done / n, f"frame {done} of {n}"),
                 )
                 self._save_scan(step.name, "scan", captured, turn_step=step)
-                self._finish_scan(step.name)
 
             capture_turn(rig, steps, capture_step, recorded, progress, self._warner("scans"))
 

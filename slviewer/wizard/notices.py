@@ -25,11 +25,7 @@ class Notices:
     def add(self, level: Level, text: str, section: str = "") -> None:
         """Add a notice and log it, without passwords; `section`: of the help's page of findings."""
         text = hide_passwords(text)
-        log.log(
-            {"warning": logging.WARNING, "error": logging.ERROR}.get(level, logging.INFO),
-            "%s",
-            text,
-        )
+        log.log(logging.getLevelNamesMapping().get(level.upper(), logging.INFO), "%s", text)
         with self._lock:
             self._count += 1
             self._latest.append(

@@ -189,12 +189,6 @@ class ResultRequests(Engine):
         if on:
             self.align()
 
-    def _finish_scan(self, name: str) -> None:
-        """Reconstruct a scan that was just captured, and align it where that is wanted."""
-        self.reconstruct(name)
-        if self._store.decision("align_scans"):
-            self.align(name)
-
     # merges
 
     @request(MERGING)
