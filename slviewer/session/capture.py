@@ -1,7 +1,7 @@
 """A capture: what the projector showed, what the camera saw, and what it is for."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -16,7 +16,6 @@ from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks,
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json, write_bytes
-from slviewer.session.names import is_safe_name
 from slviewer.session.reading import MOST_REMEMBERED, decoding, identify, read_json
 from slviewer.session.results import Exposure, Size
 from slviewer.session.stack import (
@@ -299,29 +298,6 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
             }
         ),
     )
-
-
-def read_stored_captures(folders: Iterable[Path]) -> tuple[list[Capture], dict[str, str]]:
-    """The captures in these folders, and of every other {its name: what is wrong with it, and the
-    remedy}."""
-    captures, faults = [], {}
-    for folder in folders:
-        if not is_safe_name(folder.name):
-            faults[folder.name] = (
-                f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or move"
-                " it away"
-            )
-        elif not (folder / "capture.json").is_file():
-            faults[folder.name] = (
-                f"{folder} is not a capture (it holds no capture.json): restore the file, or move"
-                " it away"
-            )
-        else:
-            try:
-                captures.append(read_capture(folder))
-            except SessionError as error:
-                faults[folder.name] = str(error)
-    return captures, faults
 
 
 def read_capture(folder: Path) -> Capture:

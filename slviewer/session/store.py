@@ -18,7 +18,6 @@ from slviewer.session.capture import (
     Role,
     compare_stored,
     read_capture,
-    read_stored_captures,
     write_capture,
 )
 from slviewer.session.decisions import Decisions
@@ -171,9 +170,25 @@ class Session(Decisions):
     def read_captures(self) -> tuple[list[Capture], dict[str, str]]:
         """The captures, and of every other folder in their place {name: what is wrong with it, and
         the remedy}."""
-        return read_stored_captures(
-            [self.folder / "captures" / name for name in self.taken_names()]
-        )
+        captures, faults = [], {}
+        for name in self.taken_names():
+            folder = self.folder / "captures" / name
+            if not is_safe_name(name):
+                faults[name] = (
+                    f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or"
+                    " move it away"
+                )
+            elif not self._has_description(name):
+                faults[name] = (
+                    f"{folder} is not a capture (it holds no capture.json): restore the file, or"
+                    " move it away"
+                )
+            else:
+                try:
+                    captures.append(read_capture(folder))
+                except SessionError as error:
+                    faults[name] = str(error)
+        return captures, faults
 
     def compare_capture(self, new: NewCapture, role: Role) -> Comparison:
         """How the capture of the name of `new`, checked, compares with it."""

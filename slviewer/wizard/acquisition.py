@@ -1,7 +1,7 @@
 """The thread that owns camera and projector: it shows, grabs and saves, and computes nothing.
 
-Between captures it grabs previews and offers the latest one. A capture is saved by the request's
-own `save` before anything else happens, or it never existed. A fault ends the capture in which it
+Between captures it grabs previews and offers the latest one. A capture is saved by its own
+`save` before anything else happens, or it never existed. A fault ends the capture in which it
 happens, with a notice; the devices are then closed and opened again, again and again until they
 answer, and the preview goes on. Other work that needs the open devices, such as a check of the rig,
 is queued among the captures, and ends and fails as they do. A stream replaces the previews until
@@ -41,24 +41,6 @@ frame."""
 _STREAM = "stream"  # what it shows during a stream
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class CaptureRequest:
-    """A request to capture: `save(captured)` is called with it on the acquisition thread.
-
-    The frames, of each of `exposures_ms` where there are any, are overwritten by the next capture.
-    """
-
-    name: str
-    sequence: PatternSequence
-    save: Callable[[CapturedFrames], None]
-    exposures_ms: tuple[float, ...] = ()
-
-    @property
-    def frames(self) -> int:
-        """The number of frames."""
-        return len(self.sequence.frames) * max(1, len(self.exposures_ms))
 
 
 @dataclass(frozen=True)
@@ -156,24 +138,29 @@ class Acquisition(Service):
             self._condition.notify_all()
         self._change_view(light=light)
 
-    def capture(self, request: CaptureRequest) -> None:
-        """Queue a capture. Raises DeviceError where no rig is open."""
+    def capture(
+        self,
+        name: str,
+        sequence: PatternSequence,
+        save: Callable[[CapturedFrames], object],
+        exposures_ms: tuple[float, ...] = (),
+    ) -> None:
+        """Queue a capture, in each of the exposures where there are any; `save(captured)` is called
+        with it, on this thread. Its frames are overwritten by the next one. Raises DeviceError
+        where no rig is open."""
+        frames = len(sequence.frames) * max(1, len(exposures_ms))
 
         def work(rig: Rig, _: Progress) -> None:
             """Capture the frames, and save them."""
             width, height = rig.camera.size
-            shape, dtype = (request.frames, height, width), rig.camera.dtype
+            shape, dtype = (frames, height, width), rig.camera.dtype
             out = self._buffer  # used again, to avoid page faults
             if out is None or out.shape != shape or out.dtype != dtype:
                 out = self._buffer = None  # free it before the next one is allocated
                 out = self._buffer = np.empty(shape, dtype)
-            request.save(
-                capture_with_texture(
-                    rig, request.sequence, request.exposures_ms, out, self._report_frame
-                )
-            )
+            save(capture_with_texture(rig, sequence, exposures_ms, out, self._report_frame))
 
-        self._queue(_Task(request.name, work, request.frames))
+        self._queue(_Task(name, work, frames))
 
     def run_task(
         self, name: str, task: Callable[[Rig, Progress], T], done: Callable[[T], None]

@@ -76,7 +76,7 @@ class Autopilot:
         """Do all acts on this thread. Raises Cancelled when stopped, SlviewerError with the notice
         of a failed act."""
         try:
-            self._operator.set_autopilot_status("Getting ready")
+            self._operator.show(autopilot="Getting ready")
             self._prepare()
             self._calibrate()
             self._verify()
@@ -84,7 +84,7 @@ class Autopilot:
             self._measure()
             self._perform_act("Writing the report", self._operator.export, "report")
         finally:
-            self._operator.set_autopilot_status("")
+            self._operator.show(autopilot="")
 
     def _prepare(self) -> None:
         """Choose the simulated rig and the target, unless they are in use. Raises SlviewerError."""
@@ -167,7 +167,7 @@ class Autopilot:
     ) -> None:
         """Send one request and wait until all its work has ended. Raises SlviewerError with the
         notice of a failure."""
-        self._operator.set_autopilot_status(act)
+        self._operator.show(autopilot=act)
         self._before(act)
         if self._stopped.wait(self._pause_s):
             raise Cancelled("autopilot was stopped")

@@ -34,7 +34,6 @@ from slviewer.session.capture import TurnStep
 from slviewer.session.importers.archive import unpack, unpacked_size
 from slviewer.session.names import new_name, plain_name
 from slviewer.session.reading import expand_user
-from slviewer.wizard.acquisition import CaptureRequest
 from slviewer.wizard.engine import request
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.result_requests import ResultRequests
@@ -133,7 +132,7 @@ class CaptureRequests(RigRequests, ResultRequests):
             self.align(name)
 
     def _queue_capture(
-        self, name: str, sequence: PatternSequence, save: Callable[[CapturedFrames], None]
+        self, name: str, sequence: PatternSequence, save: Callable[[CapturedFrames], object]
     ) -> None:
         """Queue a capture. Raises SessionError where the disk is too full."""
         reel, exposures = self._require_bench().reel, self._reader.exposures_ms()
@@ -149,7 +148,7 @@ class CaptureRequests(RigRequests, ResultRequests):
                     self._acquisition.set_light("white")
                 reel.advance()
 
-        self._acquisition.capture(CaptureRequest(name, sequence, finish, exposures))
+        self._acquisition.capture(name, sequence, finish, exposures)
 
     def _check_space(self, name: str, frames: int) -> None:
         """Raise SessionError where the disk has no room for so many frames."""

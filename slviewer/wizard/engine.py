@@ -168,7 +168,7 @@ class Engine:
         """Request a snapshot: the session's files have changed."""
         self._publisher.mark_changed(session=True)
 
-    def _show(self, **changes: Any) -> None:
+    def show(self, **changes: Any) -> None:
         """Change fields of the next snapshots."""
         with self._lock:
             self._shown = replace(self._shown, **changes)
@@ -307,7 +307,7 @@ class Engine:
             self._capture_now()
         brightness = view.brightness if self._acquisition.view().light == "white" else ""
         if brightness != self._shown.brightness:
-            self._show(brightness=brightness)
+            self.show(brightness=brightness)
         self._preview_listeners.call(view)
 
     # snapshots

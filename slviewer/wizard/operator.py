@@ -134,15 +134,6 @@ class Operator(CaptureRequests):
             self._autopilot = autopilot
             autopilot.start()
 
-    def set_autopilot_status(self, act: str) -> None:
-        """Set the autopilot's current act, which the snapshot shows; empty when it has ended."""
-        self._show(autopilot=act)
-
-    def set_preparing(self, share: float | None) -> None:
-        """Set the share of the kernels that are compiled in the background; None: none are being
-        compiled."""
-        self._show(preparing=share)
-
     def notify(self, level: Level, text: str) -> None:
         """Add a notice of the caller's own."""
         self._notices.add(level, text)

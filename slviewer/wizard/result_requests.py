@@ -248,7 +248,7 @@ class ResultRequests(Engine):
 
         `start` is its initial alignment, to which there are alternatives.
         """
-        self._show(merge_failure="", merge_refusal=None)
+        self.show(merge_failure="", merge_refusal=None)
 
         def failed(error: BaseException) -> None:
             """Store and report why the merge failed, and suggest another initial alignment where
@@ -258,7 +258,7 @@ class ResultRequests(Engine):
             if reason in ("overlap", "disagree"):
                 other = "use the initial alignment by features, or by picked points"
                 text = f"{text} Or {_ALTERNATIVES.get(start, other)}."
-            self._show(merge_failure=text, merge_refusal=reason)
+            self.show(merge_failure=text, merge_refusal=reason)
             self._notices.add("error", text, f"merge-{reason}" if reason else "merge")
 
         return failed

@@ -65,7 +65,7 @@ class RigRequests(Engine):
             self._acquisition.stop_stream()
             self._jobs.cancel_all()
             self._session_reader, self._queued = SessionReader(store, self._planner), set()
-            self._show(merge_failure="")
+            self.show(merge_failure="")
             if before:
                 before.close()
             for name in store.recovered:
@@ -129,7 +129,7 @@ class RigRequests(Engine):
     def _forget_rig(self, choice: Choice, bench: RigSetup | None) -> None:
         """Forget what was measured with the rig before, and remember the new one."""
         self._choice, self._bench, self._preview = dict(choice), bench, None
-        self._show(preflight=None, exposure_change=None)
+        self.show(preflight=None, exposure_change=None)
 
     @request("Setting the exposure")
     def set_exposure(self, exposure_ms: float | None = None, gain: float | None = None) -> None:
@@ -171,7 +171,7 @@ class RigRequests(Engine):
         def done(suggestion: ExposureSuggestion) -> None:
             """Set what was chosen."""
             before = self._store.decision("exposure") or self._acquisition.view().exposure
-            self._show(
+            self.show(
                 exposure_change=ExposureChange(suggestion, before, self._reader.exposures_ms())
             )
             first, *more = suggestion.exposures_ms
@@ -211,7 +211,7 @@ class RigRequests(Engine):
             change = self._shown.exposure_change
             if change is None:
                 raise InputError("no suggested exposure is set: nothing can be undone")
-            self._show(exposure_change=None)
+            self.show(exposure_change=None)
             self._decide_exposure(change.exposure_before, change.exposures_before_ms)
 
     def _decide_exposure(
@@ -240,7 +240,7 @@ class RigRequests(Engine):
     def _set_preflight(self, result: Preflight) -> None:
         """Store the result of a rig check, and use the delay that it measured; the session
         remembers it with the rig."""
-        self._show(preflight=result)
+        self.show(preflight=result)
         if result.settle_ms is not None and self._choice is not None:
             self._choice = {**self._choice, "settle_ms": result.settle_ms}
             self._acquisition.set_delay(result.settle_ms)
