@@ -23,7 +23,7 @@ from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import write_bytes
 from slviewer.session.reading import decoding, read_json
-from slviewer.session.results import Extent, in_threads
+from slviewer.session.results import Extent, digest_bytes, in_threads
 
 _SEPARATOR = "."
 """Between the parts of a chunk's name: with Zarr's default, "/", every frame has two folders to be
@@ -45,7 +45,7 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
         """Write one frame as a chunk and return its digest."""
         frame = _to_little_endian(np.ascontiguousarray(frames[index]))
         write_bytes(_chunk_path(path, _SEPARATOR, index), frame.data, _checksum(frame))
-        return _digest(frame)
+        return digest_bytes(frame.data)
 
     digests = in_threads(write, range(len(frames)))
     return _combine_digests(frames.shape, frames.dtype, digests)
@@ -55,7 +55,7 @@ def hash_frames(frames: np.ndarray) -> str:
     """Return the content hash that frames (n, h, w), uint8 or uint16, have once they are
     written."""
     digests = in_threads(
-        lambda frame: _digest(_to_little_endian(np.ascontiguousarray(frame))), frames
+        lambda frame: digest_bytes(_to_little_endian(np.ascontiguousarray(frame)).data), frames
     )
     return _combine_digests(frames.shape, frames.dtype, digests)
 
@@ -125,7 +125,7 @@ class FrameStack:
             self._check_size(index)
             frame = np.empty(self.shape[1:], self.dtype)
             self._read_frame(index, frame)
-            return _digest(frame)
+            return digest_bytes(frame.data)
 
         digests = in_threads(digest, range(self.shape[0]))
         return _combine_digests(self.shape, self.dtype, digests), [each.hex() for each in digests]
@@ -238,11 +238,6 @@ def _chunk_path(path: Path, separator: str, index: int) -> Path:
 def _checksum(frame: np.ndarray) -> bytes:
     """Return the CRC-32C of a frame's bytes, as Zarr appends it to a chunk."""
     return google_crc32c.value(frame).to_bytes(_CHECKSUM_BYTES, "little")
-
-
-def _digest(frame: np.ndarray) -> bytes:
-    """Return the digest of a frame's bytes, of which the content hash is made."""
-    return hashlib.blake2b(frame.data, digest_size=20).digest()
 
 
 def _to_little_endian(frame: np.ndarray) -> np.ndarray:
