@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from slviewer.devices.capture import CapturedFrames, capture_with_texture
 from slviewer.devices.protocols import Rig
 from slviewer.errors import InputError
@@ -247,9 +245,7 @@ class CaptureRequests(RigRequests, ResultRequests):
         place_object(bench)
 
         def work(rig: Rig, progress: Progress) -> None:
-            """Capture all steps into one buffer."""
-            width, height = rig.camera.size
-            buffer = np.empty((frames, height, width), rig.camera.dtype)
+            """Capture all steps."""
 
             def capture_step(step: TurnStep, progress: Progress) -> None:
                 """Capture and save one step, and queue its reconstruction."""
@@ -257,8 +253,7 @@ class CaptureRequests(RigRequests, ResultRequests):
                     rig,
                     sequence,
                     exposures,
-                    buffer,
-                    lambda done, n: progress(done / n, f"frame {done} of {n}"),
+                    progress=lambda done, n: progress(done / n, f"frame {done} of {n}"),
                 )
                 self._save_scan(step.name, "scan", captured, turn_step=step)
 
