@@ -1,7 +1,7 @@
 """A capture: what the projector showed, what the camera saw, and what it is for."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -29,10 +29,6 @@ from slviewer.session.stack import (
 Role = Literal["calibration", "scan"]
 Comparison = Literal["absent", "same", "damaged", "different"]
 """Of a stored capture with a new one: "damaged" was the same when it was saved."""
-
-_FRAMES_IN_MEMORY = (
-    8  # frames of an exposure that are in memory together while their peaks are computed
-)
 
 
 @dataclass(frozen=True)
@@ -369,17 +365,13 @@ def _choose_exposures(
 ) -> np.ndarray:
     """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its
     content."""
-    n = len(sequence.frames)
-
-    stored = FrameStack.open(folder / "frames.zarr")
-
-    def frames(exposure: int) -> Iterator[np.ndarray]:
-        """Yield the frames (h, w) of one exposure, a few in memory at a time."""
-        indices = range(exposure * n, (exposure + 1) * n)
-        for first in range(0, n, _FRAMES_IN_MEMORY):
-            yield from stored.read(indices[first : first + _FRAMES_IN_MEMORY])
-
-    highest = np.stack([peaks(frames(e)) for e in range(len(exposures_ms))])
+    n, stored = len(sequence.frames), FrameStack.open(folder / "frames.zarr")
+    highest = np.stack(
+        [
+            peaks(stored.read([index])[0] for index in range(e * n, (e + 1) * n))
+            for e in range(len(exposures_ms))
+        ]
+    )
     choice = choose_exposure(highest, exposures_ms, sequence.full_scale)
     _require_unchanged(folder, content_hash)
     choice.flags.writeable = False

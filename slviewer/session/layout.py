@@ -120,13 +120,7 @@ def remove_layout(folder: Path) -> bool:
 def inner_folders(folder: Path) -> list[str]:
     """Names of the folders in a folder, without hidden ones, in no order; none where it is
     missing."""
-    if not folder.is_dir():
-        return []
-    return [
-        entry.name
-        for entry in folder.iterdir()
-        if entry.is_dir() and not entry.name.startswith(".")
-    ]
+    return [entry.name for entry in folder.glob("[!.]*/")]
 
 
 def _is_leftover(entry: Path) -> bool:
@@ -160,7 +154,7 @@ def trash_place(trash: Path, name: str) -> Path:
 def list_trash(trash: Path) -> list[Trashed]:
     """Return what is in the trash and complete, the last deleted first."""
     entries = []
-    for place in trash.glob("*-*") if trash.is_dir() else ():
+    for place in trash.glob("*-*"):
         name, _, when = place.name.rpartition("-")
         is_capture = (place / "capture.json").is_file()
         with contextlib.suppress(ValueError):
