@@ -2,7 +2,7 @@
 
 Between captures it grabs previews and offers the latest one. A capture is saved by its own
 `save` before anything else happens, or it never existed. A fault ends the capture in which it
-happens, with a notice; the devices are then closed and opened again, again and again until they
+happens, with a notice; the devices are then closed, and opened again and again until they
 answer, and the preview goes on. Other work that needs the open devices, such as a check of the rig,
 is queued among the captures, and ends and fails as they do. A stream replaces the previews until
 anything else is requested.

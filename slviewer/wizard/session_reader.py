@@ -1,5 +1,5 @@
 """Reads what a session's files contain, for the panels. Descriptions of captures and results that
-did not change are not read again (`session.reading.remembered`); features of poses are kept."""
+did not change are not read again (`session.reading.identify`); features of poses are kept."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -200,41 +200,51 @@ class SessionReader:
         captures = [each for each in self._captures.values() if each.role == "calibration"]
         judged = [(pose, *self._judge(pose, target, calibration)) for pose in captures]
         features = {pose.name: seen for pose, _, _, seen in judged if seen}
-        camera, projector = rig.camera, rig.projector
-        if captures:
-            camera, projector = captures[0].size, captures[0].sequence.projector_size
-        plan = pending = None
-        if target and camera is not None and projector is not None:
-            stereo = None if calibration is None or calibration.refused else calibration.stereo
-            hashes = [(name, self._captures[name].hash) for name in features]
-            if stereo:
-                hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
-            refused = sum(state == "refused" for _, state, _, _ in judged)
-            given = PlanInput(
-                Board.parse(target), camera, projector, features, stereo, focal_px, refused,
-                tuple(hashes),
-            )  # fmt: skip
-            plan, is_final = self._planner.look_up(given)
-            pending = None if is_final else given
+        refused = sum(state == "refused" for _, state, _, _ in judged)
+        given = self._plan_input(target, calibration, rig, focal_px, features, refused)
+        plan, is_final = self._planner.look_up(given) if given else (None, True)
+        poses = plan.poses if plan else {}
         used_px = calibration.stereo.pose_rms_px if calibration else {}
-        views = [self._view_pose(pose, state, why, plan, used_px) for pose, state, why, _ in judged]
-        return tuple(views), plan, pending
+        views = tuple(
+            PoseView(
+                name=pose.name,
+                state=state,
+                why=why,
+                created=str(pose.meta.get("created", "")),
+                T_camera_board=(T := poses.get(pose.name)),
+                board_px=outline_px(given.board, plan.lens, T)
+                if given and plan and T is not None
+                else None,
+                rms_px=used_px.get(pose.name) if state == "used" else None,
+                thumbnail=self.thumbnails.get(pose.hash, b""),
+            )
+            for pose, state, why, _ in judged
+        )
+        return views, plan, None if is_final else given
 
-    def _view_pose(
+    def _plan_input(
         self,
-        pose: Capture,
-        state: PoseState,
-        why: str,
-        plan: PosePlan | None,
-        used_px: Mapping[str, tuple[float, float]],
-    ) -> PoseView:
-        """Return the view of a pose; ``used_px``: reprojection errors of those that were used."""
-        T, board_px = plan.poses.get(pose.name) if plan else None, None
-        if plan and T is not None:
-            board_px = outline_px(Board.parse(self.target()), plan.lens, T)
-        rms_px = used_px.get(pose.name) if state == "used" else None
-        created, thumbnail = str(pose.meta.get("created", "")), self.thumbnails.get(pose.hash, b"")
-        return PoseView(pose.name, state, why, created, T, board_px, rms_px, thumbnail)
+        target: str,
+        calibration: CalibrationView | None,
+        rig: RigView,
+        focal_px: float | None,
+        features: Mapping[str, PoseFeatures],
+        refused: int,
+    ) -> PlanInput | None:
+        """Return what the next pose is planned from; None before target and sizes are known."""
+        camera, projector = rig.camera, rig.projector
+        for first in [each for each in self._captures.values() if each.role == "calibration"][:1]:
+            camera, projector = first.size, first.sequence.projector_size
+        if not target or camera is None or projector is None:
+            return None
+        stereo = None if calibration is None or calibration.refused else calibration.stereo
+        hashes = [(name, self._captures[name].hash) for name in features]
+        if stereo:
+            hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
+        return PlanInput(
+            Board.parse(target), camera, projector, features, stereo, focal_px, refused,
+            tuple(hashes),
+        )  # fmt: skip
 
     def _judge(
         self, pose: Capture, target: str, calibration: CalibrationView | None
