@@ -201,14 +201,6 @@ class CaptureRequests(RigRequests, ResultRequests):
         captured = CapturedFrames(shot.frames, shot.settings, live.stream.sequence, source)
         self._save_scan(name, "scan", captured, label)
 
-    def subscribe_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
-        """Call back with every live cloud, on the live scan's thread; returns a function that
-        unsubscribes.
-
-        A listener must return at once.
-        """
-        return self._live_listeners.add(listener)
-
     @property
     def live_captures(self) -> int:
         """The number of short captures of the latest live scan, including those without a cloud."""

@@ -122,6 +122,9 @@ class Engine:
         self._planner = Planner(self._note_change, timing.trials)
         self._watcher = Watcher(self._handle_preview)
         self._acquisition = Acquisition(self._notices, changed, self._watcher.offer, timing)
+        # what others ask of the parts
+        self.wait_for, self.subscribe_live = self._publisher.wait_for, self._live_listeners.add
+        self.notify, self.notices = self._notices.add, self._notices.all
         self._publisher.listeners.add(self._follow_up)
         self._publisher.start()
 

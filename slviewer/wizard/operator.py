@@ -16,7 +16,7 @@ from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
 from slviewer.wizard.capture_requests import CaptureRequests
 from slviewer.wizard.engine import request
 from slviewer.wizard.service import Timing
-from slviewer.wizard.snapshot import Level, Notice, PreviewView, Snapshot
+from slviewer.wizard.snapshot import PreviewView, Snapshot
 
 
 class AutopilotLike(Protocol):
@@ -85,15 +85,6 @@ class Operator(CaptureRequests):
             unsubscribe.callback(self._preview_listeners.add(preview))
         return unsubscribe.close
 
-    def notices(self) -> tuple[Notice, ...]:
-        """Return the latest notices, oldest first, also those that no snapshot shows yet."""
-        return self._notices.all()
-
-    def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
-        """Wait for the first snapshot for which `condition` holds, and return it; None after
-        `timeout_s`."""
-        return self._publisher.wait_for(condition, timeout_s)
-
     def wait_until_idle(self, timeout_s: float = 60.0) -> Snapshot:
         """Wait until all captures, jobs and the plan of the next pose are complete; returns the
         snapshot.
@@ -133,10 +124,6 @@ class Operator(CaptureRequests):
                 raise InputError("an autopilot is running already: cancel it first")
             self._autopilot = autopilot
             autopilot.start()
-
-    def notify(self, level: Level, text: str) -> None:
-        """Add a notice of the caller's own."""
-        self._notices.add(level, text)
 
     def close(self) -> None:
         """Stop everything and close the session; captures are saved already."""
