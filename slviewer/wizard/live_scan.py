@@ -5,7 +5,6 @@ The devices' thread fills a `Stream`, and a thread of the live scan computes the
 the listeners, which must return at once. Nothing is saved unless the operator saves it.
 """
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -36,6 +35,7 @@ from slviewer.wizard.jobs import release_memory
 from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.live_motion import mask_motion
 from slviewer.wizard.notices import Notices
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import LiveView
 
 REPORTS_PER_S = 3.0
@@ -108,7 +108,7 @@ class LiveModel:
         return points, np.array(to_eight_bits(frames[-1], self.sequence.full_scale))
 
 
-class LiveScan:
+class LiveScan(Service):
     """A live scan, from its start to its end.
 
     `publish(cloud)` is called with every cloud on the scan's own thread, `changed()` when figures
@@ -125,10 +125,10 @@ class LiveScan:
         publish: Callable[[LiveCloud], None],
         changed: Callable[[], None],
     ) -> None:
+        super().__init__("slviewer live")
         self._store, self.axis, self._acquisition, self._notices = store, axis, acquisition, notices
         self._publish, self._changed = publish, changed
         self.stream = Stream(sequence, changed)
-        self._lock = threading.Lock()
         # time and latency, s, of the latest clouds
         self._made: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
         self._sent: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
@@ -136,7 +136,6 @@ class LiveScan:
         self._model: LiveModel | None = None  # of the calibration of this key, checked at that time
         self._key: tuple[object, ...] = ()
         self._loaded = 0.0
-        self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
 
     def start(self) -> None:
         """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a
@@ -154,13 +153,13 @@ class LiveScan:
     def count_shown(self, cloud: LiveCloud) -> None:
         """Record that a cloud was sent to the browsers, for rate and latency."""
         now = time.monotonic()
-        with self._lock:
+        with self._condition:
             self._sent.append((now, now - cloud.begun))
 
     def figures(self) -> LiveView:
         """Return the rates and the median latency of the last seconds."""
         now = time.monotonic()
-        with self._lock:
+        with self._condition:
             rates = _compute_rate(self._made, now), _compute_rate(self._sent, now)
             late_s = [late for _, late in self._sent]
             return LiveView(
@@ -179,7 +178,7 @@ class LiveScan:
                 self._acquisition.stop_stream()
                 return
             now = time.monotonic()
-            with self._lock:
+            with self._condition:
                 self._made.append((now, now - shot.begun))
                 self._number += 1
                 self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))

@@ -5,7 +5,6 @@ The first poses are spread by what they cover; from the third on, the rig is kno
 its information matrix to say which pose adds most.
 """
 
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -214,7 +213,7 @@ def _plan_by_coverage(
     return replace(by_coverage, suggestion=suggestion)
 
 
-class Planner:
+class Planner(LatestWorker[PlanInput]):
     """Provides the best plan available; `changed()` is called, on the planner's thread, when a
     better one is ready.
 
@@ -223,12 +222,11 @@ class Planner:
 
     def __init__(self, changed: Callable[[], None], trials: int = TRIALS) -> None:
         self._changed, self._trials = changed, trials
-        self._lock = threading.Lock()
         self._plans: dict[object, tuple[PosePlan, bool]] = {}  # and whether it is final
         # the last one that was computed and looked up
         self._latest: tuple[PlanInput, PosePlan] | None = None
         self._requested: object = None
-        self._worker = LatestWorker("slviewer planner", self._compute_plan)
+        super().__init__("slviewer planner", self._compute_plan)
 
     def look_up(self, given: PlanInput) -> tuple[PosePlan, bool]:
         """Return (the best plan available, whether it is final). One that is not final is improved
@@ -237,7 +235,7 @@ class Planner:
         Until then its poses are those of the last final plan for the same board and devices, and
         its suggestion and sigma are that plan's as long as poses were only added.
         """
-        with self._lock:
+        with self._condition:
             if cached := self._plans.get(given.key):
                 if cached[1] and given.takes_time:
                     self._latest = given, cached[0]
@@ -258,15 +256,11 @@ class Planner:
 
     def request(self, given: PlanInput) -> None:
         """Compute the plan for this input in the background, in place of an earlier request."""
-        with self._lock:
+        with self._condition:
             if self._requested == given.key or self._plans.get(given.key, (None, False))[1]:
                 return
             self._requested = given.key
-        self._worker.offer(given)
-
-    def close(self) -> None:
-        """End the thread."""
-        self._worker.close()
+        self.offer(given)
 
     def _compute_plan(self, given: PlanInput) -> None:
         """Compute the requested plan on the planner's thread and store it; an interim plan where
@@ -284,7 +278,7 @@ class Planner:
     def _cache_plan(self, given: PlanInput, plan: PosePlan, final: bool) -> tuple[PosePlan, bool]:
         """Cache a plan under its input's key, dropping the oldest where the cache is full; returns
         what `look_up` does."""
-        with self._lock:
+        with self._condition:
             while len(self._plans) >= MOST_PLANS:
                 self._plans.pop(next(iter(self._plans)))
             self._plans[given.key] = plan, final
