@@ -16,6 +16,7 @@ from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
 from slviewer.simulation.scenes import Scene, Spheres
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import SessionView, Snapshot
 
 RIG = {"driver": "simulated", "preset": "letter", "scale": 0.5, "seed": 0}
@@ -26,7 +27,7 @@ PATIENCE_S = 120.0
 """Time limit of one act."""
 
 
-class Autopilot:
+class Autopilot(Service):
     """Runs the whole wizard once. The snapshot names the current act; `before(act)` is called at
     the start of each.
 
@@ -42,27 +43,21 @@ class Autopilot:
         patience_s: float = PATIENCE_S,
         before: Callable[[str], None] = lambda act: None,
     ) -> None:
+        super().__init__("slviewer autopilot")
         self._operator, self._before, self._patience_s = operator, before, patience_s
         self._poses, self._pause_s = poses, pause_s
         self._stopped = threading.Event()
-        self._thread = threading.Thread(
-            target=self._run_and_report, name="slviewer autopilot", daemon=True
-        )
 
     @property
     def running(self) -> bool:
         """Whether the autopilot's thread is alive."""
         return self._thread.is_alive()
 
-    def start(self) -> None:
-        """Start the autopilot on a thread of its own."""
-        self._thread.start()
-
     def stop(self) -> None:
         """Send no more requests; those under way are completed."""
         self._stopped.set()
 
-    def _run_and_report(self) -> None:
+    def _serve(self) -> None:
         """Run all acts, and report completion, cancellation or failure as a notice."""
         try:
             self.run()

@@ -51,7 +51,11 @@ class Stream:
         Raises DeviceError.
         """
         count, (width, height) = len(self.sequence.frames), rig.camera.size
-        frames = self._allocate((count, height, width), rig.camera.dtype)
+        shape, dtype = (count, height, width), rig.camera.dtype
+        with self._condition:
+            frames = self._free.pop() if self._free else None
+        if frames is None or frames.shape != shape or frames.dtype != dtype:
+            frames = allocate_frames(shape, dtype)
         begun = time.monotonic()
         for k in range(count):
             if stopped():
@@ -101,14 +105,6 @@ class Stream:
             self._condition.notify_all()
         if first:
             self._on_end()
-
-    def _allocate(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """Return a buffer of this shape and dtype for frames, a free one if it fits."""
-        with self._condition:
-            buffer = self._free.pop() if self._free else None
-        if buffer is None or buffer.shape != shape or buffer.dtype != dtype:
-            return allocate_frames(shape, dtype)
-        return buffer
 
     def _recycle(self, shot: LiveCapture | None) -> None:
         """Return the buffer of a capture, if there is one, to the free list."""

@@ -63,10 +63,6 @@ class Publisher(Service):
         self.latest = first
         self.listeners = Listeners[Snapshot]()
 
-    def start(self) -> None:
-        """Start the publisher's thread, once everything exists that `build` reads."""
-        self._thread.start()
-
     def mark_changed(self, session: bool = False) -> None:
         """Request a snapshot; `session`: the session's files have changed too."""
         with self._condition:

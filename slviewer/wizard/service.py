@@ -44,6 +44,10 @@ class Service(ABC):
     def _serve(self) -> None:
         """Serve until closing."""
 
+    def start(self) -> None:
+        """Start the thread, once everything exists that it needs."""
+        self._thread.start()
+
     def close(self) -> None:
         """End the thread; returns within seconds."""
         with self._condition:
