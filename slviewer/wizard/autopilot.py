@@ -1,7 +1,6 @@
 """Runs the whole wizard on the simulated rig, by the same requests as an operator, to show it to a
 newcomer."""
 
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -46,16 +45,6 @@ class Autopilot(Service):
         super().__init__("slviewer autopilot")
         self._operator, self._before, self._patience_s = operator, before, patience_s
         self._poses, self._pause_s = poses, pause_s
-        self._stopped = threading.Event()
-
-    @property
-    def running(self) -> bool:
-        """Whether the autopilot's thread is alive."""
-        return self._thread.is_alive()
-
-    def stop(self) -> None:
-        """Send no more requests; those under way are completed."""
-        self._stopped.set()
 
     def _serve(self) -> None:
         """Run all acts, and report completion, cancellation or failure as a notice."""
@@ -164,8 +153,9 @@ class Autopilot(Service):
         notice of a failure."""
         self._operator.show(autopilot=act)
         self._before(act)
-        if self._stopped.wait(self._pause_s):
-            raise Cancelled("autopilot was stopped")
+        with self._condition:
+            if self._condition.wait_for(lambda: self._closing, self._pause_s):
+                raise Cancelled("autopilot was stopped")
         last = max((notice.number for notice in self._operator.snapshot().notices), default=0)
         request(*args, **options)
         for notice in self._wait_until_settled().notices:
@@ -188,7 +178,7 @@ class Autopilot(Service):
         SlviewerError on timeout."""
         end = time.monotonic() + self._patience_s
         while True:
-            if self._stopped.is_set():
+            if self._closing:
                 raise Cancelled("autopilot was stopped")
             try:
                 return self._operator.wait_until_idle(0.5)

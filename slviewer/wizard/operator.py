@@ -9,28 +9,13 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Protocol
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
 from slviewer.wizard.capture_requests import CaptureRequests
 from slviewer.wizard.engine import request
-from slviewer.wizard.service import Timing
+from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import PreviewView, Snapshot
-
-
-class AutopilotLike(Protocol):
-    """Sends requests by itself, on a thread of its own: the autopilot."""
-
-    @property
-    def running(self) -> bool:
-        """Whether it is sending requests."""
-
-    def start(self) -> None:
-        """Start sending requests."""
-
-    def stop(self) -> None:
-        """Stop sending requests."""
 
 
 class Operator(CaptureRequests):
@@ -46,7 +31,7 @@ class Operator(CaptureRequests):
     ) -> None:
         """Open or create `session`, with `rig`, by default the one that the session remembers."""
         super().__init__(set_up, self.capture_pose, timing or Timing())
-        self._autopilot: AutopilotLike | None = None
+        self._autopilot: Service | None = None
         if session is not None:
             self.open_session(session, rig)
         elif rig is not None:
@@ -117,7 +102,7 @@ class Operator(CaptureRequests):
             self._jobs.cancel()
 
     @request("Starting autopilot")
-    def start_autopilot(self, autopilot: AutopilotLike) -> None:
+    def start_autopilot(self, autopilot: Service) -> None:
         """Start an autopilot, which sends requests until it is done or `cancel` stops it."""
         with self._lock:
             if self._autopilot and self._autopilot.running:

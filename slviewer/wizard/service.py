@@ -48,11 +48,20 @@ class Service(ABC):
         """Start the thread, once everything exists that it needs."""
         self._thread.start()
 
-    def close(self) -> None:
-        """End the thread; returns within seconds."""
+    @property
+    def running(self) -> bool:
+        """Whether the thread is alive."""
+        return self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Let the thread end soon."""
         with self._condition:
             self._closing = True
             self._condition.notify_all()
+
+    def close(self) -> None:
+        """End the thread; returns within seconds."""
+        self.stop()
         if self._thread.ident:
             self._thread.join(5.0)
 
