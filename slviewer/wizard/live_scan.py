@@ -30,9 +30,8 @@ from slviewer.reconstruction.onepass import OnePass, PassResult
 from slviewer.reconstruction.onepass_cuda import has_pass, one_pass
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.session.store import Session
-from slviewer.wizard.acquisition import Acquisition
+from slviewer.wizard.acquisition import Acquisition, Stream
 from slviewer.wizard.jobs import release_memory
-from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.live_motion import mask_motion
 from slviewer.wizard.notices import Notices
 from slviewer.wizard.service import Service
