@@ -74,8 +74,7 @@ def write_bundle(job: Job, snapshot: Snapshot, preview: PreviewView | None, log:
             text = content if isinstance(content, str) else to_json(content).decode()
             bundle.writestr(entry, hide_passwords(text))
         job.progress(0.8, "previews")
-        shown = snapshot.session
-        views: list[PoseView | ScanView] = [*shown.poses, *shown.scans] if shown else []
+        views: list[PoseView | ScanView] = [*snapshot.content.poses, *snapshot.content.scans]
         for view in views:
             bundle.writestr(f"previews/{view.name}.jpg", view.thumbnail)
         if preview:

@@ -247,7 +247,6 @@ class Engine:
             self._jobs.submit(
                 f"Processing {capture.name}",
                 partial(self._process_capture, reader, capture),
-                failed=partial(self._handle_processing_failure, reader, capture),
                 background=True,
             )
 
@@ -256,20 +255,24 @@ class Engine:
         target pose."""
         if capture.name not in reader.session.capture_names():
             return  # deleted since
-        if capture.hash not in reader.thumbnails:
-            reader.thumbnails[capture.hash] = make_thumbnail(capture)
-            self._note_change()
-        session = reader.session.guarded(report.saving)
-        report(0.0, f"reading {capture.name}")
-        is_new = load_examination(session, capture.name) is None
         try:
-            if reader.needs_judging(capture, reader.target()):
-                self._judge_pose(reader, session, capture)
-        finally:
-            if is_new:
-                for sentence in load_or_save_examination(session, capture).warnings():
-                    self._warner("frames")(f"{capture.name}: {sentence}")
-                warn_of_captured(capture.name, capture, self._warner("check-exposure"))
+            if capture.hash not in reader.thumbnails:
+                reader.thumbnails[capture.hash] = make_thumbnail(capture)
+                self._note_change()
+            session = reader.session.guarded(report.saving)
+            report(0.0, f"reading {capture.name}")
+            is_new = load_examination(session, capture.name) is None
+            try:
+                if reader.needs_judging(capture, reader.target()):
+                    self._judge_pose(reader, session, capture)
+            finally:
+                if is_new:
+                    for sentence in load_or_save_examination(session, capture).warnings():
+                        self._warner("frames")(f"{capture.name}: {sentence}")
+                    warn_of_captured(capture.name, capture, self._warner("check-exposure"))
+        except (InputError, DamagedError) as error:
+            reader.add_unreadable(capture, str(error))
+            raise
 
     def _judge_pose(self, reader: SessionReader, session: Session, capture: Capture) -> None:
         """Read the features of a target pose, examine its frames, and save both; the next pose is
@@ -287,14 +290,6 @@ class Engine:
         judged = next(poses)
         if judged.observation is None:
             self._warner("target-poses")(f"{capture.name} cannot be used: {judged.refused}")
-
-    def _handle_processing_failure(
-        self, reader: SessionReader, capture: Capture, error: BaseException
-    ) -> None:
-        """Report that a capture could not be processed, and store why it is unreadable."""
-        self._notices.add_failure(f"Processing {capture.name}", error)
-        if isinstance(error, InputError | DamagedError):
-            reader.add_unreadable(capture, str(error))
 
     # previews
 

@@ -435,4 +435,4 @@ class Operator(RigRequests, ResultRequests):
 
 def _is_planning(snapshot: Snapshot) -> bool:
     """Whether the plan of the next pose is still being computed."""
-    return snapshot.session is not None and snapshot.session.pending_plan is not None
+    return snapshot.content.pending_plan is not None

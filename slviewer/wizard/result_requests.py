@@ -266,10 +266,10 @@ class ResultRequests(Engine):
     def _last_merge(self, missing: str) -> str:
         """Return the number of the current merge. Raises InputError with ``missing`` without
         one."""
-        session = self._publisher.refresh().session
-        if session is None or session.merge is None:
+        merge = self._publisher.refresh().content.merge
+        if merge is None:
             raise InputError(missing)
-        return session.merge.name
+        return merge.name
 
     @request("Undoing the merge")
     def undo_merge(self) -> None:

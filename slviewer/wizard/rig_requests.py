@@ -341,11 +341,11 @@ class RigRequests(Engine):
     def place_at_suggestion(self) -> bool:
         """Place the simulated board at the suggested next pose; False, with a notice, where none is
         suggested."""
-        session = self._publisher.refresh().session
-        if session is None or session.suggestion is None:
+        suggestion = self._publisher.refresh().content.suggestion
+        if suggestion is None:
             self._notices.add("error", "no pose is suggested yet: choose a rig and a target first")
             return False
-        return self.place("board", session.suggestion.T_camera_board)
+        return self.place("board", suggestion.T_camera_board)
 
     @property
     def _world(self) -> SimulatedWorld:

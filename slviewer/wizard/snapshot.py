@@ -362,9 +362,14 @@ class Snapshot:
         return self.job is not None and not self.job.background
 
     @property
+    def content(self) -> SessionView:
+        """The content of the session, which is empty until one is open."""
+        return self.session or SessionView(Path(), "", "")
+
+    @property
     def calibration(self) -> CalibrationView | None:
         """The session's calibration; None where there is none."""
-        return self.session.calibration if self.session else None
+        return self.content.calibration
 
     def step(self, key: str) -> StepView:
         """Return the step called `key`."""
@@ -372,13 +377,11 @@ class Snapshot:
 
     def pose(self, name: str) -> PoseView | None:
         """Return the pose called `name`; None where there is none."""
-        poses = self.session.poses if self.session else ()
-        return next((pose for pose in poses if pose.name == name), None)
+        return next((pose for pose in self.content.poses if pose.name == name), None)
 
     def scan(self, name: str) -> ScanView | None:
         """Return the scan called `name`; None where there is none."""
-        scans = self.session.scans if self.session else ()
-        return next((scan for scan in scans if scan.name == name), None)
+        return next((scan for scan in self.content.scans if scan.name == name), None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ Everything here follows from the session's files and the rig.
 """
 
 from collections.abc import Callable
-from pathlib import Path
 
 from slviewer.calibration.stereo import MIN_POSES
 from slviewer.evaluation.render import format_count
@@ -24,7 +23,6 @@ from slviewer.wizard.snapshot import (
 
 COVERED, MANY_POSES = 0.75, 15
 """Share of the coverage's goal, or number of poses, from which on the poses are enough."""
-_EMPTY = SessionView(Path(), "", "")
 
 
 Outlook = tuple[str, bool, str, list[str]]
@@ -43,14 +41,9 @@ def views(now: Snapshot) -> tuple[StepView, ...]:
     return tuple(made)
 
 
-def _content(now: Snapshot) -> SessionView:
-    """Return the content of the session, which is empty until one is open."""
-    return now.session or _EMPTY
-
-
 def _count_scans(now: Snapshot) -> int:
     """Return the number of scans with an up-to-date cloud."""
-    return sum(scan.purpose == "scan" and scan.cloud == "fresh" for scan in _content(now).scans)
+    return sum(scan.purpose == "scan" and scan.cloud == "fresh" for scan in now.content.scans)
 
 
 def _no_session(now: Snapshot) -> str:
@@ -60,12 +53,12 @@ def _no_session(now: Snapshot) -> str:
 
 def _no_target(now: Snapshot) -> str:
     """Return what is missing, a session or a target; else empty."""
-    return _no_session(now) or ("" if _content(now).target else "Choose the target first.")
+    return _no_session(now) or ("" if now.content.target else "Choose the target first.")
 
 
 def _no_calibration(now: Snapshot) -> str:
     """Return why there is no calibration to measure with, none or a rejected one; else empty."""
-    calibration = _content(now).calibration
+    calibration = now.content.calibration
     if calibration is None:
         return _no_session(now) or "Calibrate first."
     if not calibration.refused:
@@ -103,7 +96,7 @@ def _device_problems(now: Snapshot) -> list[str]:
 
 def _stale_calibration(now: Snapshot) -> list[str]:
     """List whether the calibration is out of date."""
-    calibration = _content(now).calibration
+    calibration = now.content.calibration
     stale = calibration.stale if calibration else ""
     return [f"The calibration is out of date: {stale}."] if stale else []
 
@@ -124,7 +117,7 @@ def _rig(now: Snapshot) -> Outlook:
 
 def _target(now: Snapshot) -> Outlook:
     """A board is chosen."""
-    target = _content(now).target
+    target = now.content.target
     instruction = "Choose your board, or print one and measure its scale bar."
     if target:
         instruction = f"Hold the board {target} in view until it is detected."
@@ -134,7 +127,7 @@ def _target(now: Snapshot) -> Outlook:
 def _poses(now: Snapshot) -> Outlook:
     """The poses suffice, by number and by predicted sigma or coverage; the last ones that were
     refused are problems."""
-    session, n = _content(now), _content(now).good_poses
+    session, n = now.content, now.content.good_poses
     blocked = _no_target(now)
     if not blocked and now.rig.state == "none" and not session.poses:
         blocked = "Choose a rig first, or import captures below."
@@ -167,7 +160,7 @@ def _describe_enough(session: SessionView) -> str:
 
 def _describe_next_pose(now: Snapshot) -> str:
     """Return where to hold the board next."""
-    session, number = _content(now), _content(now).good_poses + 1
+    session, number = now.content, now.content.good_poses + 1
     if now.session is None:
         return "Hold the board in view of camera and projector."
     if session.pending_plan:
@@ -182,7 +175,7 @@ def _describe_next_pose(now: Snapshot) -> str:
 def _calibrate(now: Snapshot) -> Outlook:
     """There is a calibration that is up to date and not refused; good poses that it lacks are
     problems."""
-    session, calibration, n = _content(now), _content(now).calibration, _content(now).good_poses
+    session, calibration, n = now.content, now.content.calibration, now.content.good_poses
     problems, blocked, done = _stale_calibration(now), "", False
     if calibration is None:
         blocked, instruction = _no_target(now), f"Calibrate from {n} poses."
@@ -222,7 +215,7 @@ def _describe_calibration(calibration: CalibrationView) -> str:
 
 def _verify(now: Snapshot) -> Outlook:
     """There is an up-to-date verification; those of an older calibration are problems."""
-    records = _content(now).list_records(Verification)
+    records = now.content.list_records(Verification)
     stale = [each.name for each in records if each.stale]
     problems = [*_device_problems(now), *_stale_calibration(now)]
     if stale:
@@ -247,7 +240,7 @@ def _scan(now: Snapshot) -> Outlook:
         )
     stale = [
         f"{scan.label} was reconstructed with an older calibration: reconstruct it again."
-        for scan in _content(now).scans
+        for scan in now.content.scans
         if scan.cloud == "stale"
     ]
     problems = [*_device_problems(now), *_stale_calibration(now), *stale]
@@ -256,7 +249,7 @@ def _scan(now: Snapshot) -> Outlook:
 
 def _merge(now: Snapshot) -> Outlook:
     """There is an up-to-date merge; scans whose overlap is too small are problems."""
-    merge, blocked, problems = _content(now).merge, _no_calibration(now), list[str]()
+    merge, blocked, problems = now.content.merge, _no_calibration(now), list[str]()
     done = merge is not None and not merge.stale
     instruction = "Choose the scans and the reference, and merge."
     if done:
@@ -280,7 +273,7 @@ def _merge(now: Snapshot) -> Outlook:
 
 def _measure(now: Snapshot) -> Outlook:
     """There is an up-to-date measurement; those whose surface has changed are problems."""
-    session, blocked, problems = _content(now), _no_calibration(now), []
+    session, blocked, problems = now.content, _no_calibration(now), []
     stale = [measured.label for measured in session.measurements if measured.stale]
     has_surface = session.merge or any(scan.cloud == "fresh" for scan in session.scans)
     if not (blocked or session.measurements or has_surface):
@@ -295,8 +288,8 @@ def _measure(now: Snapshot) -> Outlook:
 
 def _export(now: Snapshot) -> Outlook:
     """There is a file; a rejected calibration can be exported too."""
-    exports, blocked = _content(now).exports, ""
-    if _content(now).calibration is None:
+    exports, blocked = now.content.exports, ""
+    if now.content.calibration is None:
         blocked = _no_calibration(now)
     instruction = "Choose what to write: a cloud, a mesh, the calibration, the report."
     if exports:
