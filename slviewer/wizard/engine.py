@@ -271,7 +271,7 @@ class Engine:
                         self._warner("frames")(f"{capture.name}: {sentence}")
                     warn_of_captured(capture.name, capture, self._warner("check-exposure"))
         except (InputError, DamagedError) as error:
-            reader.add_unreadable(capture, str(error))
+            reader.unreadable[capture.name, capture.hash, reader.target()] = str(error)
             raise
 
     def _judge_pose(self, reader: SessionReader, session: Session, capture: Capture) -> None:
@@ -359,10 +359,8 @@ class Engine:
 
     def _follow_up(self, snapshot: Snapshot) -> None:
         """Act on a new snapshot: retry failed reads, plan the next pose, end hands-free capture."""
-        session = snapshot.session
-        faults = (
-            (snapshot.read_failure,) if snapshot.read_failure else session.faults if session else ()
-        )
+        session = snapshot.content
+        faults = (snapshot.read_failure,) if snapshot.read_failure else session.faults
         new_faults = [fault for fault in faults if fault not in self._reported_faults]
         self._reported_faults &= set(faults)
         self._failed_reads = self._failed_reads + 1 if new_faults else 0
@@ -373,12 +371,10 @@ class Engine:
             for fault in new_faults:
                 self._notices.add("error", fault)
         watch = Watch()
-        if session and session.target:
+        if session.target:
             lens = session.plan.lens if session.plan else None
             watch = Watch(Board.parse(session.target), lens)
         self._watcher.watch = watch
-        if session is None:
-            return
         if session.pending_plan:
             self._planner.request(session.pending_plan)
             return

@@ -116,7 +116,9 @@ class Operator(RigRequests, ResultRequests):
         while True:
             # captures first: each submits its jobs before it ends
             idle = self.wait_for(
-                lambda now: self._acquisition.idle and self._jobs.idle and not _is_planning(now),
+                lambda now: (
+                    self._acquisition.idle and self._jobs.idle and not now.content.pending_plan
+                ),
                 end - time.monotonic(),
             )
             if idle is None:
@@ -124,7 +126,7 @@ class Operator(RigRequests, ResultRequests):
                     f"work is still running after {timeout_s:g} s: cancel it, or wait longer"
                 )
             now = self._publisher.refresh()
-            if not _is_planning(now) and self._publisher.is_current:
+            if not now.content.pending_plan and self._publisher.is_current:
                 return now
 
     @request("Cancelling")
@@ -431,8 +433,3 @@ class Operator(RigRequests, ResultRequests):
         )
         self._queue_processing()
         return describe_import(names, role=role)
-
-
-def _is_planning(snapshot: Snapshot) -> bool:
-    """Whether the plan of the next pose is still being computed."""
-    return snapshot.content.pending_plan is not None

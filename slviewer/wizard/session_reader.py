@@ -62,7 +62,8 @@ class SessionReader:
         self.session = session
         self.thumbnails: dict[str, bytes] = {}  # by the content hash of a capture
         self._planner = planner
-        self._unreadable: dict[tuple[str, str, str], str] = {}  # by name, content hash and target
+        # why poses cannot be evaluated, by name, content hash and target
+        self.unreadable: dict[tuple[str, str, str], str] = {}
         # by content hash and target, also of poses that are not judged yet
         self._features: dict[tuple[str, str], PoseFeatures] = {}
         self._faults: list[str] = []  # what could not be read this time
@@ -74,10 +75,6 @@ class SessionReader:
         sigma = observation.samples.sigma if observation.samples else np.zeros(0)
         seen = observation.points, observation.camera, observation.projector
         self._features[capture.hash, target] = _make_features(*seen, sigma)
-
-    def add_unreadable(self, capture: Capture, why: str) -> None:
-        """Store why a pose cannot be evaluated, so that it is not tried again."""
-        self._unreadable[capture.name, capture.hash, self.target()] = why
 
     def target(self) -> str:
         """Return the board's notation, empty where it is unknown or a board of a plugin that is not
@@ -94,7 +91,7 @@ class SessionReader:
         return (
             capture.role == "calibration"
             and bool(target)
-            and (capture.name, capture.hash, target) not in self._unreadable
+            and (capture.name, capture.hash, target) not in self.unreadable
             and self._load_judgement(capture, target) is None
         )
 
@@ -254,7 +251,7 @@ class SessionReader:
         excluded = self.session.valid_decision("excluded") or {}
         if pose.name in excluded:
             return "excluded", excluded[pose.name], None
-        if why := self._unreadable.get((pose.name, pose.hash, target)):
+        if why := self.unreadable.get((pose.name, pose.hash, target)):
             return "refused", why, None
         meta = self._load_judgement(pose, target)
         if meta is None:
