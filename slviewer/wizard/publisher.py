@@ -2,7 +2,6 @@
 together."""
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Generic
@@ -89,14 +88,9 @@ class Publisher(Service):
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
         """Wait for the first snapshot for which `condition` holds, and return it; None after
         `timeout_s`."""
-        end = time.monotonic() + timeout_s
         with self._condition:
-            while not condition(self.latest):
-                remaining_s = end - time.monotonic()
-                if remaining_s <= 0 or self._closing:
-                    return None
-                self._condition.wait(remaining_s)
-            return self.latest
+            self._condition.wait_for(lambda: condition(self.latest) or self._closing, timeout_s)
+            return self.latest if condition(self.latest) else None
 
     def _serve(self) -> None:
         """Build and publish a snapshot after each batch of changes, or after a failure, until
@@ -109,10 +103,8 @@ class Publisher(Service):
                 )
                 if self._closing:
                     return
-                requested, session = (
-                    self._requested,
-                    self._session_changed or bool(self.latest.read_failure),
-                )
+                requested = self._requested
+                session = self._session_changed or bool(self.latest.read_failure)
                 self._session_changed = self._urgent = False
             version = self.latest.version + 1
             try:

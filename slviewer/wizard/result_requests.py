@@ -89,7 +89,7 @@ class ResultRequests(Engine):
         store.trash_capture(name)
         store.include(name)
         for kind in ("poses", "clouds", "verify", "trust", PLACEMENTS):
-            if store.state_of(f"{kind}/{name}") != "absent":
+            if store.has_result(f"{kind}/{name}"):
                 store.trash_result(f"{kind}/{name}")
 
     @request("Restoring")
