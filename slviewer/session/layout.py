@@ -198,23 +198,15 @@ class WriterLock:
         with contextlib.suppress(OSError):  # it is only for the message to others
             self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
 
-    def release(self) -> None:
-        """Release the lock for the next writer."""
+    def release(self, remove: bool = False) -> None:
+        """Release the lock for the next writer, and remove its file where the folder is a session
+        no more: a writer that waits for it then begins with a new one."""
         if self._lock.is_locked:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # Windows removes no open file: an empty one stays
                 self._holder.unlink(missing_ok=True)
+                if remove:
+                    Path(self._lock.lock_file).unlink()
             self._lock.release()
-
-    def release_and_remove(self) -> None:
-        """Remove the lock's files and release it: a writer that waits for it then begins with a new
-        file.
-
-        Only for a folder that is a session no more.
-        """
-        with contextlib.suppress(OSError):  # Windows removes no open file: an empty one stays
-            self._holder.unlink(missing_ok=True)
-            Path(self._lock.lock_file).unlink()
-        self._lock.release()
 
     @property
     def held(self) -> bool:

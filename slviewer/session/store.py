@@ -117,7 +117,7 @@ class Session(Decisions):
             return
         with contextlib.suppress(OSError):  # what cannot be removed stays
             if layout.remove_layout(self.folder):
-                self._lock.release_and_remove()
+                self._lock.release(remove=True)
                 if self._created == "folder":
                     self.folder.rmdir()
 

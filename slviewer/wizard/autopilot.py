@@ -16,7 +16,7 @@ from slviewer.simulation.plans import objects, planes, spheres
 from slviewer.simulation.scenes import Scene, Spheres
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.service import Service
-from slviewer.wizard.snapshot import SessionView, Snapshot
+from slviewer.wizard.snapshot import Snapshot
 
 RIG = {"driver": "simulated", "preset": "letter", "scale": 0.5, "seed": 0}
 TARGET = "circles:21x16:9"
@@ -77,23 +77,26 @@ class Autopilot(Service):
             self._perform_act("Choosing the simulated rig", operator.choose_rig, RIG)
         if operator.wait_for(lambda s: s.rig.state == "open", self._patience_s) is None:
             raise SlviewerError("the simulated rig does not open")
-        if self._read_session().target != TARGET:
+        if self._wait_until_settled().content.target != TARGET:
             self._perform_act(f"Choosing the target {TARGET}", operator.choose_target, TARGET)
 
     def _calibrate(self) -> None:
         """Capture suggested poses until there are enough, then calibrate. Raises SlviewerError if
         too many fail."""
-        operator = self._operator
-        tried = 0
-        while (good := (now := self._read_session()).good_poses) < self._poses and not now.enough:
+        operator, tried = self._operator, 0
+        while not (now := self._wait_until_settled().content).enough:
+            if now.good_poses >= self._poses:
+                break
             tried += 1
             if tried > 2 * self._poses:
                 raise SlviewerError(
-                    f"only {good} of {tried} poses could be used: see why the others were refused"
+                    f"only {now.good_poses} of {tried} poses could be used: see why the others were"
+                    " refused"
                 )
             act = now.suggestion.sentence if now.suggestion else "Placing the board"
             self._perform_act(act, operator.place_at_suggestion)
-            self._perform_act(f"Capturing pose {good + 1} of {self._poses}", operator.capture_pose)
+            act = f"Capturing pose {now.good_poses + 1} of {self._poses}"
+            self._perform_act(act, operator.capture_pose)
         self._perform_act("Calibrating", operator.calibrate)
 
     def _verify(self) -> None:
@@ -162,16 +165,13 @@ class Autopilot(Service):
             if notice.number > last and notice.level == "error":
                 raise SlviewerError(f"{act}: {notice.text}")
 
-    def _read_session(self) -> SessionView:
-        """Return the session once no work runs. Raises SlviewerError where none is open."""
-        session = self._wait_until_settled().session
-        if session is None:
-            raise SlviewerError("no session is open: open or create one first")
-        return session
-
     def _list_scans(self, purpose: str) -> list[str]:
         """List the names of captures made for a purpose: scan, plane or sphere."""
-        return [scan.name for scan in self._read_session().scans if scan.purpose == purpose]
+        return [
+            scan.name
+            for scan in self._wait_until_settled().content.scans
+            if scan.purpose == purpose
+        ]
 
     def _wait_until_settled(self) -> Snapshot:
         """Wait until no work runs; returns the snapshot. Raises Cancelled when stopped,

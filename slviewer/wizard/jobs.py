@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from slviewer.errors import Cancelled
@@ -224,10 +225,8 @@ class Jobs(Service):
         ):
             if not job.background:
                 self._notices.add("info", f"{job.name}: cancelled")
-        elif job.error and job.failed:
-            job.failed(job.error)
         elif job.error:
-            self._notices.add_failure(job.name, job.error)
+            (job.failed or partial(self._notices.add_failure, job.name))(job.error)
         elif job.done:
             job.done(job.result)
 

@@ -262,10 +262,8 @@ class Operator(RigRequests, ResultRequests):
 
     def _next_name(self, kind: str) -> str:
         """Return the next unused name, such as pose_07, counting saved and queued captures."""
-        used_names = [*self._store.taken_names(), *self._acquisition.names()]
-        numbers = [
-            name.removeprefix(f"{kind}_") for name in used_names if name.startswith(f"{kind}_")
-        ]
+        used = [*self._store.taken_names(), *self._acquisition.names()]
+        numbers = [name.removeprefix(f"{kind}_") for name in used]
         number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
         return f"{kind}_{number:02d}"
 
