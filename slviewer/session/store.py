@@ -255,10 +255,19 @@ class Session(Decisions):
                         f"two captures are named {new.name!r}: rename one of their folders"
                     )
                 new_name(new.name, (*taken, *staged))
-                replace = force if isinstance(force, bool) else new.name in force
-                staged[new.name] = self._stage(
-                    new, role, None if board is None else str(board), replace
-                )
+                target = self._capture_folder(new.name)
+                replaces = force if isinstance(force, bool) else new.name in force
+                if target.exists() and not replaces:
+                    raise InputError(
+                        f"there is a capture {new.name!r} already: choose another name, or replace"
+                        " it with --force"
+                    )
+                if role not in get_args(Role):
+                    raise InputError(f"role {role!r} is unknown: use 'calibration' or 'scan'")
+                new.check()
+                with atomic.staged_folder(target, new.nbytes) as written:
+                    write_capture(written, new, role, None if board is None else str(board))
+                staged[new.name] = atomic.mark_complete(written)
                 del new  # before the next one is made
         except BaseException:
             for folder in staged.values():
@@ -296,17 +305,17 @@ class Session(Decisions):
         """Return what is in the trash and complete, the last deleted first."""
         return list_trash(self.folder / "trash")
 
+    def _place_of(self, entry: Trashed) -> Path:
+        """Return the place of a capture or result that is in the trash."""
+        return (self._capture_folder if entry.is_capture else self._result_folder)(entry.name)
+
     def restore(self, entries: Iterable[Trashed]) -> None:
         """Bring captures and results back from the trash, in one step; what has their names now
         takes their places."""
         self._require_writer()
         changes = atomic.Together(self.folder)
         for each in entries:
-            target = (
-                self._capture_folder(each.name)
-                if each.is_capture
-                else self._result_folder(each.name)
-            )
+            target = self._place_of(each)
             target.parent.mkdir(parents=True, exist_ok=True)
             changes.replace(target, each.place, self._trash_place(target))
         changes.commit()
@@ -319,7 +328,7 @@ class Session(Decisions):
             raise InputError(
                 f"there is no deleted {'result' if '/' in name else 'capture'} {name!r}"
             )
-        if (self._capture_folder if found.is_capture else self._result_folder)(name).exists():
+        if self._place_of(found).exists():
             raise InputError(f"there is a {name!r} again: delete that one first")
         self.restore([found])
 
@@ -544,22 +553,6 @@ class Session(Decisions):
             raise SessionError(f"{self.folder} is open for reading only: open it with write=True")
         if self._allow is not None:
             self._allow()
-
-    def _stage(self, capture: NewCapture, role: Role, board: str | None, force: bool) -> Path:
-        """Write a capture next to its place, and return the folder, which `atomic.commit`
-        renames."""
-        target = self._capture_folder(capture.name)
-        if target.exists() and not force:
-            raise InputError(
-                f"there is a capture {capture.name!r} already: choose another name, or replace it"
-                " with --force"
-            )
-        if role not in get_args(Role):
-            raise InputError(f"role {role!r} is unknown: use 'calibration' or 'scan'")
-        capture.check()
-        with atomic.staged_folder(target, capture.nbytes) as staged:
-            write_capture(staged, capture, role, board)
-        return atomic.mark_complete(staged)
 
     def _capture_folder(self, name: str) -> Path:
         """Return the folder of a capture; InputError for an unsafe name."""
