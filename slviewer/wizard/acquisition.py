@@ -284,13 +284,15 @@ class Acquisition(Service):
                 raise DeviceError(self._view.fault or _NOT_OPEN)
             if self._requests or self._view.capture:
                 raise DeviceError("a capture is running: wait for it, or cancel it")
-            self.stop_stream(stream)
+            before, self._stream = self._stream, stream
+            self._condition.notify_all()
+        if before:
+            before.end()
 
-    def stop_stream(self, successor: Stream | None = None) -> None:
-        """End the stream, if there is one; the devices are free within a frame, or capture its
-        successor."""
+    def stop_stream(self) -> None:
+        """End the stream, if there is one; the devices are free within a frame."""
         with self._condition:
-            stream, self._stream = self._stream, successor
+            stream, self._stream = self._stream, None
             self._condition.notify_all()
         if stream:
             stream.end()
@@ -487,7 +489,8 @@ class Acquisition(Service):
         with self._condition:
             if now := self._view.capture:
                 progress = replace(now, frame=frame, frames=frames, stage=stage)
-                self._change_view(capture=progress)
+                self._view = replace(self._view, capture=progress)
+        self._changed()
 
     def _handle_fault(self, error: Exception) -> None:
         """Report a device fault, close the devices, drop waiting requests and end the stream."""
@@ -516,10 +519,12 @@ class Acquisition(Service):
         """Replace fields of the rig's view, unless another rig was chosen meanwhile, and notify."""
         with self._condition:
             if self._rig is self._wanted:
-                self._change_view(**changes)
+                self._view = replace(self._view, **changes)
+        self._changed()
 
     def _change_view(self, **changes: Any) -> None:
-        """Replace fields of the rig's view, and notify."""
+        """Replace fields of the rig's view, and notify, without the lock: who is notified may hold
+        one of its own, and ask for the view."""
         with self._condition:
             self._view = replace(self._view, **changes)
         self._changed()

@@ -132,13 +132,16 @@ class Jobs(Service):
 
     def cancel(self) -> None:
         """Cancel the running foreground job, else the first waiting one; other jobs continue."""
+        dropped = list[_Job]()
         with self._condition:
             if self._running and not self._running.background:
                 self._running.reporter.cancel()
                 self._condition.notify_all()
-            elif requested := [job for job in self._waiting if not job.background]:
-                self._waiting.remove(requested[0])
-                self._notices.add("info", f"{requested[0].name}: cancelled")
+            else:
+                dropped = [job for job in self._waiting if not job.background][:1]
+                self._waiting = [job for job in self._waiting if job not in dropped]
+        for job in dropped:
+            self._notices.add("info", f"{job.name}: cancelled")
         self._changed()
 
     def cancel_all(self) -> None:
