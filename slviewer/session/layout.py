@@ -120,7 +120,13 @@ def remove_layout(folder: Path) -> bool:
 def inner_folders(folder: Path) -> list[str]:
     """Names of the folders in a folder, without hidden ones, in no order; none where it is
     missing."""
-    return [entry.name for entry in folder.glob("[!.]*/")]
+    if not folder.is_dir():
+        return []
+    return [
+        entry.name
+        for entry in folder.iterdir()
+        if entry.is_dir() and not entry.name.startswith(".")
+    ]
 
 
 def _is_leftover(entry: Path) -> bool:
