@@ -201,7 +201,7 @@ def estimated_bytes(
 ) -> int:
     """Estimate the size of a file of so many points and faces: within 1 % of binary files, some 20
     % of texts."""
-    fixed, point, colour, scalar, face = _SIZES[file_format]
+    fixed, point, colour, scalar, face = _SIZES.get(file_format, _SIZES["xyz"])
     if file_format == "obj":
         face += 6 * len(str(points))
     return fixed + points * (point + colour * colours + scalar * scalars) + faces * face
