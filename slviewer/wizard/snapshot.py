@@ -339,7 +339,6 @@ class Snapshot:
     notices: tuple[Notice, ...] = ()
     steps: tuple[StepView, ...] = ()
     space: Space | None = None
-    brightness: Brightness = ""  # of the camera's image in white light
     hands_free: bool = False
     autopilot: str = ""  # what it does now; empty where it is off
     preflight: Preflight | None = None  # result of the last check of the rig in use
@@ -355,6 +354,7 @@ class Snapshot:
     preparing: float | None = (
         None  # share of the kernels compiled in the background; None while none are
     )
+    brightness: Brightness = ""  # of the camera's image in white light
 
     @property
     def is_busy(self) -> bool:
