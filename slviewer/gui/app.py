@@ -167,7 +167,7 @@ def run(
                 operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session))
             )
         app = App(operator, serving or Serving(), pages=pages, print_links=print_links)
-        preparation = Preparation(operator.set_preparing)
+        preparation = Preparation(lambda share: operator.show(preparing=share))
         preparation.start()
         with contextlib.ExitStack() as ended:
             ended.callback(app.close)

@@ -45,7 +45,7 @@ from slviewer.report.canvas import finish_figure, new_figure, style_axes
 from slviewer.report.page import Figure
 from slviewer.report.surfaces import draw_deviations, section_plot
 from slviewer.session.inspection_plan import OWN_PLAN
-from slviewer.wizard.measure_requests import PLAN, TABLE
+from slviewer.wizard.result_requests import PLAN, TABLE
 
 _ROUND = 48
 _OFF = 0.01

@@ -16,7 +16,7 @@ defaults, and leaves checks of values to `__post_init__`::
 Records nest: a field may be another dataclass, a tuple, a mapping or an optional of these. Name
 fields after their keys on disk, and no method is needed. Where a published record holds computed
 figures too, add them to the plain fields: `to_plain(self) | {"decision": self.decision}`.
-`session.atomic.write_synced_json` and the commands' `--json` take dataclasses as they are.
+`session.atomic.to_json` and the commands' `--json` take dataclasses as they are.
 Properties are not written.
 """
 

@@ -71,19 +71,9 @@ def write_bytes(path: Path, *parts: Any) -> None:
         os.fsync(file.fileno())
 
 
-def write_synced_json(path: Path, data: Any) -> None:
-    """Write a new JSON file and sync it. Takes what `records.plain.to_plain` takes."""
-    write_bytes(path, to_json(data))
-
-
 def to_json(data: Any) -> bytes:
     """Encode as readable UTF-8 JSON; NaN stays NaN, as Python's own reader understands it."""
     return (json.dumps(data, indent=2, ensure_ascii=False, default=to_plain) + "\n").encode()
-
-
-def replace_json(path: Path, data: Any) -> None:
-    """Replace a JSON file by a new one in one step."""
-    replace_file(path, to_json(data))
 
 
 def replace_file(path: Path, data: bytes) -> None:
@@ -196,10 +186,6 @@ class Together:
         if replaced is not None:
             discard(replaced)
 
-    def move_away(self, target: Path, old_to: Path) -> None:
-        """Let ``target`` go to ``old_to``; a folder staged for it is removed."""
-        self.replace(target, None, old_to)
-
     def folder_for(self, target: Path) -> Path:
         """Return where the content of ``target`` is now: a path that does not exist where it is to
         go."""
@@ -259,38 +245,22 @@ def _finish_together(decided: Path) -> None:
 
 def _read_changes(decided: Path) -> list[tuple[Path, Path | None, Path | None]]:
     """The changes that a file of `Together` lists; DamagedError where it lists anything but paths
-    in its folder."""
-
-    def inside(name: str | None) -> Path | None:
-        """Return the path of a name below the file's folder; raises ValueError for others."""
-        path = None if name is None else decided.parent / name
-        if path and (".." in path.parts or decided.parent not in path.parents):
-            raise ValueError(f"{name} is outside of {decided.parent}")
-        return path
-
-    changes = []
-    with decoding(decided):
-        for listed in read_json(decided)["changes"]:
-            target, staged, old_to = map(inside, listed)
-            if target is None:
-                raise ValueError("a change without a target")
-            changes.append((target, staged, old_to))
-    return changes
-
-
-def _check_unlinked(decided: Path) -> None:
-    """Raise DamagedError where a link leads a change that a file of `Together` lists out of the
-    file's folder.
+    in its folder, or a link leads one out of it.
 
     The file may have come with the session from somebody else, who would so delete any folder of
     this user.
     """
-    root = decided.parent.resolve()
-    for path in (path for change in _read_changes(decided) for path in change if path is not None):
-        if not path.parent.resolve().is_relative_to(root):
-            raise DamagedError(
-                f"{decided} is damaged ({path} is outside of {root}): nothing was changed there"
-            )
+    root, changes = decided.parent, []
+    with decoding(decided):
+        for listed in read_json(decided)["changes"]:
+            target, staged, old_to = (None if name is None else root / name for name in listed)
+            for path in filter(None, (target, staged, old_to)):
+                if ".." in path.parts or not path.parent.resolve().is_relative_to(root.resolve()):
+                    raise ValueError(f"{path} is outside of {root}")
+            if target is None:
+                raise ValueError("a change without a target")
+            changes.append((target, staged, old_to))
+    return changes
 
 
 def move(folder: Path, target: Path) -> None:
@@ -336,7 +306,6 @@ def recover(root: Path, trash_place: Callable[[Path], Path]) -> list[Path]:
     for path in list_leftovers(root):
         if path.parent == root and path.name.startswith(f".{_TOGETHER}.new-"):
             with suppress(DamagedError):
-                _check_unlinked(path)
                 _finish_together(path)
             discard(path)
     for path in list_leftovers(root):

@@ -1,8 +1,7 @@
 """A capture: what the projector showed, what the camera saw, and what it is for."""
 
 import hashlib
-import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -16,9 +15,8 @@ from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.plain import from_plain
-from slviewer.session.atomic import to_json, write_bytes, write_synced_json
-from slviewer.session.names import is_safe_name
-from slviewer.session.reading import decoding, read_json
+from slviewer.session.atomic import to_json, write_bytes
+from slviewer.session.reading import MOST_REMEMBERED, decoding, identify, read_json
 from slviewer.session.results import Exposure, Size
 from slviewer.session.stack import (
     FrameStack,
@@ -31,10 +29,6 @@ from slviewer.session.stack import (
 Role = Literal["calibration", "scan"]
 Comparison = Literal["absent", "same", "damaged", "different"]
 """Of a stored capture with a new one: "damaged" was the same when it was saved."""
-
-_FRAMES_IN_MEMORY = (
-    8  # frames of an exposure that are in memory together while their peaks are computed
-)
 
 
 @dataclass(frozen=True)
@@ -270,56 +264,51 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
     frames_hash = write_stack(folder / "frames.zarr", frames)
     described = capture.sequence.to_dict()
     if texture is not None:
-        write_bytes(folder / "texture.png", _encode_png(texture))
-    write_synced_json(
+        import cv2
+
+        # the fastest setting: level 1 halves nothing that matters and PNG stays readable everywhere
+        done, data = cv2.imencode(
+            ".png", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        )
+        if not done:
+            raise InputError(
+                "the texture could not be encoded as PNG: give a colour image of 8 or 16 bits"
+            )
+        write_bytes(folder / "texture.png", data.data)
+    write_bytes(
         folder / "capture.json",
-        {
-            "role": role,
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "source": capture.source,
-            "board": board,
-            "camera": {"size": [frames.shape[2], frames.shape[1]], "dtype": str(frames.dtype)},
-            "frames": len(frames),
-            **({"exposures_ms": exposures_ms} if exposures_ms else {}),
-            **({"files": capture.files} if capture.files else {}),
-            "hash": _hash_content(frames_hash, described, exposures_ms, texture),
-            "texture": texture is not None,
-            "settings": capture.settings,
-            "sequence": described,
-        },
+        to_json(
+            {
+                "role": role,
+                "created": datetime.now(UTC).isoformat(timespec="seconds"),
+                "source": capture.source,
+                "board": board,
+                "camera": {"size": [frames.shape[2], frames.shape[1]], "dtype": str(frames.dtype)},
+                "frames": len(frames),
+                **({"exposures_ms": exposures_ms} if exposures_ms else {}),
+                **({"files": capture.files} if capture.files else {}),
+                "hash": _hash_content(frames_hash, described, exposures_ms, texture),
+                "texture": texture is not None,
+                "settings": capture.settings,
+                "sequence": described,
+            }
+        ),
     )
-
-
-def read_stored_captures(folders: Iterable[Path]) -> tuple[list[Capture], dict[str, str]]:
-    """The captures in these folders, and of every other {its name: what is wrong with it, and the
-    remedy}."""
-    captures, faults = [], {}
-    for folder in folders:
-        if not is_safe_name(folder.name):
-            faults[folder.name] = (
-                f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or move"
-                " it away"
-            )
-        elif not (folder / "capture.json").is_file():
-            faults[folder.name] = (
-                f"{folder} is not a capture (it holds no capture.json): restore the file, or move"
-                " it away"
-            )
-        else:
-            try:
-                captures.append(read_capture(folder))
-            except SessionError as error:
-                faults[folder.name] = str(error)
-    return captures, faults
 
 
 def read_capture(folder: Path) -> Capture:
     """The capture in a folder; its frames stay there. SessionError where its description is
     damaged."""
+    return _read_capture(folder, identify(folder / "capture.json"))
+
+
+@lru_cache(MOST_REMEMBERED)
+def _read_capture(folder: Path, identity: object) -> Capture:
+    """Read a capture, as `read_capture` does."""
     meta = read_json(folder / "capture.json")
     with decoding(folder / "capture.json"):
         described = from_plain(meta, _Description)
-        sequence = _read_sequence(json.dumps(described.sequence))
+        sequence = PatternSequence.from_dict(described.sequence)
         if "turntable" in described.settings:
             from_plain(described.settings["turntable"], TurnStep)
     return Capture(
@@ -342,12 +331,6 @@ def compare_stored(folder: Path, new: NewCapture, role: Role) -> Comparison:
     except SessionError:
         return "damaged"
     return "same"
-
-
-@lru_cache(maxsize=16)
-def _read_sequence(text: str) -> PatternSequence:
-    """Return the sequence that JSON describes; cached, as the captures of a session share a few."""
-    return PatternSequence.from_dict(json.loads(text))
 
 
 def _hash_content(
@@ -382,17 +365,13 @@ def _choose_exposures(
 ) -> np.ndarray:
     """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its
     content."""
-    n = len(sequence.frames)
-
-    stored = FrameStack.open(folder / "frames.zarr")
-
-    def frames(exposure: int) -> Iterator[np.ndarray]:
-        """Yield the frames (h, w) of one exposure, a few in memory at a time."""
-        indices = range(exposure * n, (exposure + 1) * n)
-        for first in range(0, n, _FRAMES_IN_MEMORY):
-            yield from stored.read(indices[first : first + _FRAMES_IN_MEMORY])
-
-    highest = np.stack([peaks(frames(e)) for e in range(len(exposures_ms))])
+    n, stored = len(sequence.frames), FrameStack.open(folder / "frames.zarr")
+    highest = np.stack(
+        [
+            peaks(stored.read([index])[0] for index in range(e * n, (e + 1) * n))
+            for e in range(len(exposures_ms))
+        ]
+    )
     choice = choose_exposure(highest, exposures_ms, sequence.full_scale)
     _require_unchanged(folder, content_hash)
     choice.flags.writeable = False
@@ -405,18 +384,3 @@ def _require_unchanged(folder: Path, content_hash: str) -> None:
         raise SessionError(
             f"capture {folder.name!r} was replaced while it was in use: load it again"
         )
-
-
-def _encode_png(texture: np.ndarray) -> Any:
-    """Encode a texture (h, w, 3) RGB uint8 or uint16 as PNG; returns the file's bytes."""
-    import cv2
-
-    # the fastest setting: level 1 halves nothing that matters and PNG stays readable everywhere
-    done, data = cv2.imencode(
-        ".png", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 1]
-    )
-    if not done:
-        raise InputError(
-            "the texture could not be encoded as PNG: give a colour image of 8 or 16 bits"
-        )
-    return data.data

@@ -17,7 +17,7 @@ import msgspec
 
 from slviewer.errors import DamagedError, InputError
 from slviewer.records.plain import from_plain
-from slviewer.session.atomic import replace_file, replace_json
+from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.names import natural_key, new_name
 from slviewer.session.reading import read_json
 from slviewer.session.results import Exposure
@@ -121,7 +121,7 @@ class Decisions:
         self._require_writer()
         path = self.folder / "decisions.json"
         with self._decisions_lock:
-            replace_json(path, {**_read_all(path)[0], what: make()})
+            replace_file(path, to_json({**_read_all(path)[0], what: make()}))
 
     def save_rig(self, name: str, text: str) -> Path:
         """Keep the operator's own rig, TOML, in place of one of that name; returns its file."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.patterns import render_pattern
-from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.atomic import commit, replace_file, staged_folder, to_json, write_bytes
 from slviewer.session.reading import expand_user
 from slviewer.session.toml import describe_sequence
@@ -34,7 +34,12 @@ def write_calibration(
     if suffix == ".json":
         data = to_json({"meanings": meanings, **entries} if meanings else dict(entries))
     elif suffix in (".yml", ".yaml", ".xml"):
-        data = _format_file_storage(suffix, entries, meanings).encode()
+        storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+        for key, value in entries.items():
+            if key in meanings:
+                storage.writeComment(f"{key}: {meanings[key]}", False)
+            _write_entry(storage, key, value)
+        data = storage.releaseAndGetString().encode()
     else:
         raise InputError(
             f"{path.name}: a calibration is written as .yml, .xml or .json: choose one of these"
@@ -51,9 +56,14 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
     folder = expand_user(folder).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} is not empty: choose a new folder for the patterns")
-    names = [
-        f"{index:02d}_{_describe_frame(frame)}.png" for index, frame in enumerate(sequence.frames)
-    ]
+    names = []
+    for index, frame in enumerate(sequence.frames):
+        parts: list[Any] = [frame.kind, frame.axis]
+        if frame.kind == "phase":
+            parts += [f"{frame.period_px:g}px", f"{frame.step:02d}"]
+        elif frame.kind in ("gray", "inverse"):
+            parts += [f"bit{frame.bit:02d}"]
+        names.append("_".join([f"{index:02d}", *(str(part) for part in parts if part)]) + ".png")
     with staged_folder(folder, len(names) * 4096) as staged:
         for index, name in enumerate(names):
             done, data = cv2.imencode(".png", render_pattern(sequence, index))
@@ -64,29 +74,6 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
             write_bytes(staged / name, data.data)
         write_bytes(staged / "sequence.toml", describe_sequence(sequence, names).encode())
     commit(staged, folder)
-
-
-def _describe_frame(frame: Frame) -> str:
-    """Return a frame's file name without suffix: kind, axis, and period and step or bit."""
-    parts: list[Any] = [frame.kind, frame.axis]
-    if frame.kind == "phase":
-        parts += [f"{frame.period_px:g}px", f"{frame.step:02d}"]
-    elif frame.kind in ("gray", "inverse"):
-        parts += [f"bit{frame.bit:02d}"]
-    return "_".join(str(part) for part in parts if part)
-
-
-def _format_file_storage(
-    suffix: str, entries: Mapping[str, Any], meanings: Mapping[str, str]
-) -> str:
-    """Return entries as the text of an OpenCV FileStorage file, each with its meaning as a
-    comment."""
-    storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    for key, value in entries.items():
-        if key in meanings:
-            storage.writeComment(f"{key}: {meanings[key]}", False)
-        _write_entry(storage, key, value)
-    return storage.releaseAndGetString()
 
 
 def _write_entry(storage: Any, key: str, value: Any) -> None:

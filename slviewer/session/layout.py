@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from slviewer import __version__
 from slviewer.errors import DamagedError, SessionError
-from slviewer.session.atomic import disk_errors, replace_json
+from slviewer.session.atomic import disk_errors, replace_file, to_json
 from slviewer.session.reading import expand_user, read_json
 
 _IS_WINDOWS = sys.platform == "win32"
@@ -28,13 +28,13 @@ do not read."""
 
 def is_session(path: str | Path) -> bool:
     """Whether a session, readable or not, is in this folder."""
-    return (_absolute_path(path) / "session.json").is_file()
+    return (expand_user(path) / "session.json").is_file()
 
 
 def session_folder(path: str | Path) -> Path:
     """The absolute folder of an existing session; SessionError where it is missing, damaged or
     newer."""
-    folder = _absolute_path(path)
+    folder = expand_user(path).absolute()
     if not is_session(folder):
         raise SessionError(
             f"{folder} is not a session folder (it holds no session.json): give the folder of a"
@@ -56,7 +56,7 @@ def session_folder(path: str | Path) -> Path:
 def new_folder(path: str | Path) -> tuple[Path, bool]:
     """A folder that a session may be made in, and whether it was made here, else empty;
     SessionError otherwise."""
-    folder = _absolute_path(path)
+    folder = expand_user(path).absolute()
     if _IS_WINDOWS and len(str(folder)) > _LONGEST_FOLDER:
         raise SessionError(
             f"the path of the session has {len(str(folder))} characters, and Windows allows 259 for"
@@ -86,17 +86,15 @@ def create_layout(folder: Path) -> None:
         for inner in ("captures", "results"):
             (folder / inner).mkdir(exist_ok=True)
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    replace_json(
-        folder / "session.json",
-        {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"},
-    )
+    described = {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"}
+    replace_file(folder / "session.json", to_json(described))
 
 
 def raise_schema(folder: Path) -> None:
     """State the newest schema in an older session, before anything is saved that needs it."""
     described = read_json(folder / "session.json")
     if described["schema"] < SCHEMA:
-        replace_json(folder / "session.json", {**described, "schema": SCHEMA})
+        replace_file(folder / "session.json", to_json({**described, "schema": SCHEMA}))
 
 
 def remove_layout(folder: Path) -> bool:
@@ -141,11 +139,6 @@ def _is_leftover(entry: Path) -> bool:
     )
 
 
-def _absolute_path(path: str | Path) -> Path:
-    """Return an absolute path, with "~" expanded."""
-    return expand_user(path).absolute()
-
-
 _TIME = "%Y%m%dT%H%M%S%f"
 
 
@@ -167,7 +160,7 @@ def trash_place(trash: Path, name: str) -> Path:
 def list_trash(trash: Path) -> list[Trashed]:
     """Return what is in the trash and complete, the last deleted first."""
     entries = []
-    for place in trash.glob("*-*") if trash.is_dir() else ():
+    for place in trash.glob("*-*"):
         name, _, when = place.name.rpartition("-")
         is_capture = (place / "capture.json").is_file()
         with contextlib.suppress(ValueError):
@@ -211,23 +204,15 @@ class WriterLock:
         with contextlib.suppress(OSError):  # it is only for the message to others
             self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
 
-    def release(self) -> None:
-        """Release the lock for the next writer."""
+    def release(self, remove: bool = False) -> None:
+        """Release the lock for the next writer, and remove its file where the folder is a session
+        no more: a writer that waits for it then begins with a new one."""
         if self._lock.is_locked:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # Windows removes no open file: an empty one stays
                 self._holder.unlink(missing_ok=True)
+                if remove:
+                    Path(self._lock.lock_file).unlink()
             self._lock.release()
-
-    def release_and_remove(self) -> None:
-        """Remove the lock's files and release it: a writer that waits for it then begins with a new
-        file.
-
-        Only for a folder that is a session no more.
-        """
-        with contextlib.suppress(OSError):  # Windows removes no open file: an empty one stays
-            self._holder.unlink(missing_ok=True)
-            Path(self._lock.lock_file).unlink()
-        self._lock.release()
 
     @property
     def held(self) -> bool:

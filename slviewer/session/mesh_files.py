@@ -48,13 +48,19 @@ IN_WORDS = {
     "xyz": "mm; text, x y z of a point a line, and its colour",
 }
 """Units and content of each format."""
-FACET_BYTES = 50
 _GLB_LIMIT = 2**32 - 1
 DECIMALS = 6
 """Of lengths in text: a nanometre, below what a float32 of some hundred mm resolves."""
-_NUMBER, _SMALL, _GREY = 11, 9, 4
-"""Characters that a coordinate, a sigma or a part of a normal, and a grey level take in text, with
-the blank."""
+_SIZES = {
+    "ply": (300, 24, 3, 4, FACE.itemsize),
+    "stl": (84, 0, 0, 0, 50),
+    "glb": (1200, 24, 4, 0, 12),
+    "e57": (4000, 12, 3, 0, 0),
+    "3mf": (1500, 14, 0, 0, 7),
+    "obj": (200, 66, 21, 0, 9),
+    "xyz": (0, 33, 12, 0, 0),
+}
+"""Bytes of a file, of each of its points, their colours and scalars, and of each face."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +119,7 @@ def write_shape(
     points, faces = (
         (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
     )
-    _check_format(path, is_mesh=faces is not None)
+    _check_format(path, file_format, is_mesh=faces is not None)
     if not len(points) or (faces is not None and not len(faces)):
         raise InputError(f"{path.name} would be empty: there is nothing to write")
     if not np.isfinite(points).all():
@@ -139,10 +145,9 @@ def write_shape(
     return path.stat().st_size
 
 
-def _check_format(path: Path, is_mesh: bool) -> None:
-    """Raise InputError unless points or meshes can be written in the format of the suffix."""
+def _check_format(path: Path, file_format: str, is_mesh: bool) -> None:
+    """Raise InputError unless points or meshes can be written in the format."""
     formats = mesh_formats() if is_mesh else point_formats()
-    file_format = path.suffix.lower().removeprefix(".")
     if file_format not in formats:
         what = "a mesh" if is_mesh else "a cloud"
         why = ": it has no triangles" if file_format in mesh_formats() else ""
@@ -196,20 +201,10 @@ def estimated_bytes(
 ) -> int:
     """Estimate the size of a file of so many points and faces: within 1 % of binary files, some 20
     % of texts."""
-    if file_format == "ply":
-        return 300 + points * (24 + 3 * colours + 4 * scalars) + faces * FACE.itemsize
-    if file_format == "stl":
-        return 84 + faces * FACET_BYTES
-    if file_format == "glb":
-        return 1200 + points * (24 + 4 * colours) + 12 * faces
-    if file_format == "e57":
-        return 4000 + points * (12 + 3 * colours)
-    if file_format == "3mf":
-        return 1500 + 14 * points + 7 * faces
+    fixed, point, colour, scalar, face = _SIZES.get(file_format, _SIZES["xyz"])
     if file_format == "obj":
-        vertex = 3 * _NUMBER + 3 * _SMALL + 6 + 21 * colours
-        return 200 + points * vertex + faces * (9 + 6 * len(str(points)))
-    return points * (3 * _NUMBER + 3 * _GREY * colours)
+        face += 6 * len(str(points))
+    return fixed + points * (point + colour * colours + scalar * scalars) + faces * face
 
 
 def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> None:

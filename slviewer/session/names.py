@@ -58,6 +58,13 @@ def safe_path(name: str) -> str:
     return name
 
 
+def plain_name(text: str, otherwise: str) -> str:
+    """Return a valid name made from one of elsewhere: ASCII letters, digits, '_', '-' and '.', the
+    last 100 characters; ``otherwise`` where nothing remains."""
+    plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", text).lstrip(".-")
+    return safe_name(plain[-100:].lstrip(".-") or otherwise)
+
+
 def clean_label(text: str) -> str:
     """Return an operator's name for something, without surplus space. Raises InputError for
     characters that are not printable: controls, and marks that change the direction of writing."""

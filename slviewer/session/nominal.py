@@ -73,18 +73,23 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     `MAX_TRIANGLES`.
     """
     path = expand_user(path)
-    data = _read_bytes(path)
+    if path.suffix.lower() not in FORMATS:
+        raise SessionError(
+            f"{path.name} is not a nominal model that can be read: give an STL, PLY, OBJ, STEP or"
+            " 3MF file"
+        )
+    remedy = f"give a file of up to {MAX_BYTES >> 20} MiB"
+    data = read_input(path, MAX_BYTES, remedy, SessionError)
     notes: list[str] = []
     if (form := path.suffix.lower()[1:]) in cad.PACKAGES:
         vertices, faces = cad.load_triangles(path.name, form, data)
-        _check_triangles(path.name, vertices, faces)
         units = "mm"
         if form != "3mf":
             notes.append(f"its surfaces were triangulated within {cad.CHORD_MM:g} mm")
     else:
         vertices, faces = _load_triangles(path.name, data)
-        _check_triangles(path.name, vertices, faces)
-        vertices = vertices * MM[units or "mm"]
+    _check_triangles(path.name, vertices, faces)
+    vertices = vertices * MM[units or "mm"]
     if not np.abs(vertices).max() < MAX_COORDINATE_MM:
         raise SessionError(
             f"{path.name} reaches {np.abs(vertices).max():.3g} mm: models up to"
@@ -133,18 +138,6 @@ def check_size(nominal: Nominal, points: np.ndarray) -> None:
 def _format_size(size: float) -> str:
     """A size in three digits or more, never with an exponent."""
     return f"{size:,.0f}" if size >= 100 else f"{size:#.3g}"
-
-
-def _read_bytes(path: Path) -> bytes:
-    """Return the content of a model's file; SessionError for another format, or one too large to
-    read."""
-    if path.suffix.lower() not in FORMATS:
-        raise SessionError(
-            f"{path.name} is not a nominal model that can be read: give an STL, PLY, OBJ, STEP or"
-            " 3MF file"
-        )
-    remedy = f"give a file of up to {MAX_BYTES >> 20} MiB"
-    return read_input(path, MAX_BYTES, remedy, SessionError)
 
 
 def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ import re
 import stat
 import subprocess
 import sys
+import time
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -30,6 +31,8 @@ _MAX_INTEGER = 1 << 63
 _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
 _DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){32}""")
 _REMEDY = "restore it from a copy, or compute or import it again"
+MOST_REMEMBERED = 4096
+_SETTLED_NS = 2 * 10**9
 _INVALID = (
     KeyError,
     TypeError,
@@ -94,6 +97,17 @@ def read_json(
     if not isinstance(data, dict):
         raise DamagedError(f"{path} holds no JSON object: {remedy}")
     return data
+
+
+def identify(path: Path) -> object:
+    """Return what changes whenever a file does, by which its reader remembers what it read. It is
+    something new each time where the file is missing, or so new that its time may not show that it
+    is written again: clocks of file systems are coarse."""
+    with suppress(OSError):
+        status = path.stat()
+        if time.time_ns() - status.st_mtime_ns > _SETTLED_NS:
+            return status.st_ino, status.st_size, status.st_mtime_ns
+    return object()
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:

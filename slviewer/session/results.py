@@ -7,13 +7,12 @@ older results have none, and only `verify_result` tells whether they are damaged
 
 import hashlib
 import io
-import math
-import os
 import tokenize
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, TypedDict, TypeVar
 
 import google_crc32c
 import msgspec
@@ -24,11 +23,18 @@ from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain
 from slviewer.records.record import Count, Vector
 from slviewer.records.verdict import Examination
-from slviewer.session.atomic import to_json, write_bytes, write_synced_json
+from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.layout import inner_folders
 from slviewer.session.names import safe_path
-from slviewer.session.reading import decoding, open_regular, read_file, read_json
+from slviewer.session.reading import (
+    MOST_REMEMBERED,
+    decoding,
+    identify,
+    read_file,
+    read_json,
+)
 
+T = TypeVar("T")
 Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
 Size = tuple[Extent, Extent]
 _Matrix3 = tuple[Vector, Vector, Vector]
@@ -228,37 +234,45 @@ def check_result(
     return checked
 
 
+def in_threads(function: Callable[..., T], *arguments: Iterable[Any]) -> list[T]:
+    """Return what a function returns for each of the arguments, as `map` does: moving and hashing
+    files releases the interpreter, and more than four threads only queue for the disk."""
+    with ThreadPoolExecutor(4) as pool:
+        return list(pool.map(function, *arguments))
+
+
 def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write a checked result into an empty folder, every file synced. Its hash covers meta and
     arrays."""
 
     def write(name: str) -> tuple[bytes, int]:
         """Write one array as .npy, synced, and return digest and CRC-32C of the file."""
-        array = np.asarray(arrays[name], order="C")
-        header, path = _make_header(array), _array_path(folder, name)
+        content, path = io.BytesIO(), _array_path(folder, name)
+        np.lib.format.write_array(content, np.asarray(arrays[name], order="C"), version=(1, 0))
         path.parent.mkdir(parents=True, exist_ok=True)
-        body = array.reshape(-1).view(np.uint8).data if array.size else b""
-        write_bytes(path, header, body)
-        whole = hashlib.blake2b(header, digest_size=20)
-        whole.update(body)
-        return whole.digest(), _checksum(header, array)
+        write_bytes(path, data := content.getvalue())
+        return digest_bytes(data), google_crc32c.value(data)
 
     names = sorted(arrays)
-    with ThreadPoolExecutor(4) as pool:
-        digests = dict(zip(names, pool.map(write, names), strict=True))
+    digests = dict(zip(names, in_threads(write, names), strict=True))
     content_hash = _combine_digests(meta, {name: digest for name, (digest, _) in digests.items()})
     checksums = {name: checksum for name, (_, checksum) in digests.items()}
-    write_synced_json(
-        folder / "meta.json",
-        {**meta, "hash": content_hash, "arrays": names, "checksums": checksums},
-    )
+    saved = {**meta, "hash": content_hash, "arrays": names, "checksums": checksums}
+    write_bytes(folder / "meta.json", to_json(saved))
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
-    """`meta` as it was saved, with its content `hash` and the names and checksums of its `arrays`.
+    """`meta` as it was saved, with its content `hash` and the names and checksums of its `arrays`;
+    not to be changed, as it is read once.
 
     Raises DamagedError where these, or its `inputs`, are not what the session writes.
     """
+    return _read_meta(folder, identify(folder / "meta.json"))
+
+
+@lru_cache(MOST_REMEMBERED)
+def _read_meta(folder: Path, identity: object) -> dict[str, Any]:
+    """Read `meta`, as `read_meta` does."""
     meta = read_json(folder / "meta.json")
     with decoding(folder / "meta.json"):
         check_meta("/".join(folder.parts[-2:]), meta)
@@ -273,12 +287,8 @@ def verify_result(folder: Path) -> None:
     names = meta.get("arrays", [])
     try:
         digests = {
-            n: (
-                hashlib.blake2b(
-                    read_file(_array_path(folder, n), MAX_ARRAY_BYTES), digest_size=20
-                ).digest()
-            )
-            for n in names
+            name: digest_bytes(read_file(_array_path(folder, name), MAX_ARRAY_BYTES))
+            for name in names
         }
     except OSError as error:
         raise _damage(folder, str(error)) from error
@@ -301,7 +311,7 @@ def read_arrays(
         if only is not None and name not in only:
             continue
         try:
-            arrays[name] = _read_array(_array_path(folder, name))
+            arrays[name] = _read_array(_array_path(folder, name), checksums.get(name))
         except (
             OSError,
             ValueError,
@@ -312,29 +322,20 @@ def read_arrays(
             MemoryError,
         ) as error:
             raise _damage(folder, f"array {name}: {error}") from error
-        if (
-            name in checksums
-            and _checksum(_make_header(arrays[name]), arrays[name]) != checksums[name]
-        ):
-            raise _damage(folder, f"array {name} differs from its checksum")
     return arrays
 
 
-def _read_array(path: Path) -> np.ndarray:
-    """Read a .npy file. Raises ValueError unless it holds exactly the numbers or texts that its
-    header announces."""
-    with open_regular(path) as file:
-        header = np.lib.format
-        read_header = {(1, 0): header.read_array_header_1_0, (2, 0): header.read_array_header_2_0}
-        shape, _, dtype = read_header[header.read_magic(file)](file)
-        size, start = os.fstat(file.fileno()).st_size, file.tell()
-        if dtype.kind not in "biufU" or any(extent < 0 for extent in shape):
-            raise ValueError(f"it holds {dtype} {shape}, no numbers")
-        if math.prod(shape) * dtype.itemsize != size - start:
-            raise ValueError(f"its {size} bytes are not those of {dtype} {shape}")
-        file.seek(0)
-        array: np.ndarray = np.load(file, allow_pickle=False)
-        return array
+def _read_array(path: Path, checksum: int | None) -> np.ndarray:
+    """Read a .npy file. Raises ValueError unless it is what was saved, or where that is not known
+    exactly the numbers or texts that its header announces."""
+    data = read_file(path, MAX_ARRAY_BYTES)
+    if checksum is not None and google_crc32c.value(data) != checksum:
+        raise ValueError("it differs from its checksum")
+    content = io.BytesIO(data)
+    array: np.ndarray = np.lib.format.read_array(content, allow_pickle=False)
+    if array.dtype.kind not in "biufU" or content.read(1):
+        raise ValueError(f"its {len(data)} bytes are not numbers {array.dtype} {array.shape}")
+    return array
 
 
 def _array_path(folder: Path, name: str) -> Path:
@@ -342,17 +343,9 @@ def _array_path(folder: Path, name: str) -> Path:
     return folder / _ARRAY_FOLDER / f"{name}.npy"
 
 
-def _make_header(array: np.ndarray) -> bytes:
-    """Return the header of the .npy file of a C-contiguous array."""
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))
-    return header.getvalue()
-
-
-def _checksum(header: bytes, array: np.ndarray) -> int:
-    """Return the CRC-32C of the .npy file of a C-contiguous array."""
-    checksum: int = google_crc32c.extend(google_crc32c.value(header), array if array.size else b"")
-    return checksum
+def digest_bytes(data: bytes | memoryview) -> bytes:
+    """Return the digest of bytes, of which content hashes are made."""
+    return hashlib.blake2b(data, digest_size=20).digest()
 
 
 def _combine_digests(meta: Mapping[str, Any], digests: Mapping[str, bytes]) -> str:

@@ -71,7 +71,13 @@ def save_edits(store: Session, scan: str, history: EditHistory) -> None:
         for i, edit in enumerate(history.edits)
         if edit.pixels is not None
     }
-    entries = [_to_plain(edit) for edit in history.edits]
+    entries = []
+    for edit in history.edits:
+        plane: dict[str, Any] = dict.fromkeys(("normal", "offset_mm", "margin_mm"))
+        if edit.plane is not None:
+            plane = {**to_plain(edit.plane), "normal": list(edit.plane.normal)}
+        entry = {"kind": edit.kind, "what": edit.what, "points": edit.points}
+        entries.append({**entry, **plane, "made": edit.made})
     content = hashlib.blake2b(digest_size=20)
     for i, entry in enumerate(entries[: history.applied]):
         used = sorted((key, value) for key, value in entry.items() if key != "made")
@@ -122,14 +128,6 @@ def _load_meta(store: Session, scan: str) -> dict[str, Any]:
     """Return the stored edits of a scan, without pixels; empty where it has none."""
     name = f"{FOLDER}/{scan}"
     return store.load_result(name, only=())[0] if store.has_result(name) else {}
-
-
-def _to_plain(edit: Edit) -> dict[str, object]:
-    """Return an edit as plain values, without its pixels."""
-    plane: dict[str, Any] = dict.fromkeys(("normal", "offset_mm", "margin_mm"))
-    if edit.plane is not None:
-        plane = {**to_plain(edit.plane), "normal": list(edit.plane.normal)}
-    return {"kind": edit.kind, "what": edit.what, "points": edit.points, **plane, "made": edit.made}
 
 
 def _read_edit(entry: dict[str, Any], packed: np.ndarray | None, size: tuple[int, int]) -> Edit:

@@ -11,7 +11,6 @@ import hashlib
 import os
 import sys
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,11 +23,8 @@ from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import write_bytes
 from slviewer.session.reading import decoding, read_json
-from slviewer.session.results import Extent
+from slviewer.session.results import Extent, digest_bytes, in_threads
 
-_THREADS = (
-    4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
-)
 _SEPARATOR = "."
 """Between the parts of a chunk's name: with Zarr's default, "/", every frame has two folders to be
 synced too."""
@@ -42,27 +38,42 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
 
     Raises InputError for any other shape or type.
     """
+    import zarr  # half a second; needed only to write
+    from zarr.codecs import Crc32cCodec
+
     check_stack_array(frames)
-    _create_array(path, frames.shape, _DTYPES[frames.dtype])
+    zarr.create_array(
+        path,
+        shape=frames.shape,
+        dtype=_DTYPES[frames.dtype],
+        chunks=(1, *frames.shape[1:]),
+        compressors=[Crc32cCodec()],
+        filters=None,
+        fill_value=0,
+        zarr_format=3,
+        dimension_names=["frame", "v", "u"],
+        chunk_key_encoding={"name": "default", "separator": _SEPARATOR},
+    )
+    with open(path / "zarr.json", "rb") as file:
+        os.fsync(file.fileno())
+    stack = FrameStack(path, frames.shape, frames.dtype, _SEPARATOR, has_checksums=True)
 
     def write(index: int) -> bytes:
         """Write one frame as a chunk and return its digest."""
         frame = _to_little_endian(np.ascontiguousarray(frames[index]))
-        write_bytes(_chunk_path(path, _SEPARATOR, index), frame.data, _checksum(frame))
-        return _digest(frame)
+        write_bytes(stack.chunk_path(index), frame.data, _checksum(frame))
+        return digest_bytes(frame.data)
 
-    with ThreadPoolExecutor(_THREADS) as pool:
-        digests = list(pool.map(write, range(len(frames))))
+    digests = in_threads(write, range(len(frames)))
     return _combine_digests(frames.shape, frames.dtype, digests)
 
 
 def hash_frames(frames: np.ndarray) -> str:
     """Return the content hash that frames (n, h, w), uint8 or uint16, have once they are
     written."""
-    with ThreadPoolExecutor(_THREADS) as pool:
-        digests = list(
-            pool.map(lambda frame: _digest(_to_little_endian(np.ascontiguousarray(frame))), frames)
-        )
+    digests = in_threads(
+        lambda frame: digest_bytes(_to_little_endian(np.ascontiguousarray(frame)).data), frames
+    )
     return _combine_digests(frames.shape, frames.dtype, digests)
 
 
@@ -116,39 +127,35 @@ class FrameStack:
         """
         n = self.shape[0]
         wanted = check_indices(self.path.parent.name, indices, n)
+        size = self.shape[1] * self.shape[2] * self.dtype.itemsize
         for index in wanted:  # before memory is allocated for what the description announces
-            self._check_size(index)
+            if self._status(index).st_size != size + _CHECKSUM_BYTES * self.has_checksums:
+                raise self._damage(index, "is cut short, or longer than it was")
         frames = np.empty((len(wanted), *self.shape[1:]), self.dtype)
-        with ThreadPoolExecutor(_THREADS) as pool:
-            list(pool.map(self._read_frame, wanted, frames))
+        in_threads(self._read_frame, wanted, frames)
         return frames if sys.byteorder == "little" else frames.byteswap(inplace=True)
 
     def hash(self) -> tuple[str, list[str]]:
         """Read the whole stack; returns its content hash, as `write_stack` does, and the hash of
         each frame, BLAKE2b of 160 bits. Raises DamagedError as `read`."""
-
-        def digest(index: int) -> bytes:
-            """Read one frame and return its digest."""
-            self._check_size(index)
-            frame = np.empty(self.shape[1:], self.dtype)
-            self._read_frame(index, frame)
-            return _digest(frame)
-
-        with ThreadPoolExecutor(_THREADS) as pool:
-            digests = list(pool.map(digest, range(self.shape[0])))
+        digests = in_threads(
+            lambda index: digest_bytes(_to_little_endian(self.read([index])).data),
+            range(self.shape[0]),
+        )
         return _combine_digests(self.shape, self.dtype, digests), [each.hex() for each in digests]
 
     def identify(self) -> tuple[tuple[int, ...], ...]:
         """Return what changes whenever a frame's file does: number, size and time of each. Raises
         DamagedError where a file is missing."""
-        return tuple(map(self._identify_frame, range(self.shape[0])))
+        statuses = map(self._status, range(self.shape[0]))
+        return tuple((each.st_ino, each.st_size, each.st_mtime_ns) for each in statuses)
 
     def _read_frame(self, index: int, frame: np.ndarray) -> None:
         """Read one frame, little-endian, into `frame` (h, w). Raises DamagedError where it is not
         what was saved."""
         checksum = bytearray(_CHECKSUM_BYTES * self.has_checksums)
         try:
-            with open(self._chunk_path(index), "rb") as file:  # regular, as its size was right
+            with open(self.chunk_path(index), "rb") as file:  # regular, as its size was right
                 whole = file.readinto(frame.data.cast("B")) == frame.nbytes
                 whole = whole and file.readinto(checksum) == len(checksum)
         except OSError as error:
@@ -158,31 +165,23 @@ class FrameStack:
         if checksum and checksum != _checksum(frame):
             raise self._damage(index, "differs from its checksum")
 
-    def _check_size(self, index: int) -> None:
-        """Raise DamagedError unless a frame's file has the size that the description announces."""
-        frame_bytes = self.shape[1] * self.shape[2] * self.dtype.itemsize
-        if self._identify_frame(index)[1] != frame_bytes + _CHECKSUM_BYTES * self.has_checksums:
-            raise self._damage(index, "is cut short, or longer than it was")
-
-    def _identify_frame(self, index: int) -> tuple[int, ...]:
-        """Return number, size and time of a frame's file. Raises DamagedError where it is
-        missing."""
+    def _status(self, index: int) -> os.stat_result:
+        """Return the status of a frame's file. Raises DamagedError where it is missing."""
         try:
-            status = self._chunk_path(index).stat()
+            return self.chunk_path(index).stat()
         except OSError as error:
             raise self._error(index, error) from error
-        return status.st_ino, status.st_size, status.st_mtime_ns
 
-    def _chunk_path(self, index: int) -> Path:
+    def chunk_path(self, index: int) -> Path:
         """Return the file of one frame's chunk."""
-        return _chunk_path(self.path, self.separator, index)
+        return self.path / self.separator.join(("c", str(index), "0", "0"))
 
     def _error(self, index: int, error: OSError) -> SessionError:
         """Return the error for a chunk that cannot be read: damage, unless it is for want of
         permission."""
         if isinstance(error, PermissionError):
             return SessionError(
-                f"{self._chunk_path(index)} cannot be read ({error}): check its permissions"
+                f"{self.chunk_path(index)} cannot be read ({error}): check its permissions"
             )
         missing = isinstance(error, FileNotFoundError | NotADirectoryError)
         return self._damage(
@@ -193,7 +192,7 @@ class FrameStack:
         """Return the error for a damaged frame, with the capture's name and the remedy."""
         return DamagedError(
             f"{self.path.parent.name}: frame {index + 1} of {self.shape[0]} is damaged"
-            f" ({self._chunk_path(index)} {fault}): "
+            f" ({self.chunk_path(index)} {fault}): "
             "restore this file from a copy, or import or record the capture again"
         )
 
@@ -216,41 +215,9 @@ def check_stack_array(frames: np.ndarray) -> None:
         raise InputError(f"frames of 8 or 16 bits (uint8, uint16) are needed, got {frames.dtype}")
 
 
-def _create_array(path: Path, shape: tuple[int, ...], dtype: str) -> None:
-    """Create the metadata of an uncompressed Zarr v3 array with one chunk, and its checksum, a
-    frame."""
-    import zarr  # half a second; needed only to write
-    from zarr.codecs import Crc32cCodec
-
-    zarr.create_array(
-        path,
-        shape=shape,
-        dtype=dtype,
-        chunks=(1, *shape[1:]),
-        compressors=[Crc32cCodec()],
-        filters=None,
-        fill_value=0,
-        zarr_format=3,
-        dimension_names=["frame", "v", "u"],
-        chunk_key_encoding={"name": "default", "separator": _SEPARATOR},
-    )
-    with open(path / "zarr.json", "rb") as file:
-        os.fsync(file.fileno())
-
-
-def _chunk_path(path: Path, separator: str, index: int) -> Path:
-    """Return the file of one frame's chunk."""
-    return path / separator.join(("c", str(index), "0", "0"))
-
-
 def _checksum(frame: np.ndarray) -> bytes:
     """Return the CRC-32C of a frame's bytes, as Zarr appends it to a chunk."""
     return google_crc32c.value(frame).to_bytes(_CHECKSUM_BYTES, "little")
-
-
-def _digest(frame: np.ndarray) -> bytes:
-    """Return the digest of a frame's bytes, of which the content hash is made."""
-    return hashlib.blake2b(frame.data, digest_size=20).digest()
 
 
 def _to_little_endian(frame: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar, get_args
 
@@ -18,7 +18,6 @@ from slviewer.session.capture import (
     Role,
     compare_stored,
     read_capture,
-    read_stored_captures,
     write_capture,
 )
 from slviewer.session.decisions import Decisions
@@ -118,7 +117,7 @@ class Session(Decisions):
             return
         with contextlib.suppress(OSError):  # what cannot be removed stays
             if layout.remove_layout(self.folder):
-                self._lock.release_and_remove()
+                self._lock.release(remove=True)
                 if self._created == "folder":
                     self.folder.rmdir()
 
@@ -171,9 +170,25 @@ class Session(Decisions):
     def read_captures(self) -> tuple[list[Capture], dict[str, str]]:
         """The captures, and of every other folder in their place {name: what is wrong with it, and
         the remedy}."""
-        return read_stored_captures(
-            [self.folder / "captures" / name for name in self.taken_names()]
-        )
+        captures, faults = [], {}
+        for name in self.taken_names():
+            folder = self.folder / "captures" / name
+            if not is_safe_name(name):
+                faults[name] = (
+                    f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or"
+                    " move it away"
+                )
+            elif not self._has_description(name):
+                faults[name] = (
+                    f"{folder} is not a capture (it holds no capture.json): restore the file, or"
+                    " move it away"
+                )
+            else:
+                try:
+                    captures.append(read_capture(folder))
+                except SessionError as error:
+                    faults[name] = str(error)
+        return captures, faults
 
     def compare_capture(self, new: NewCapture, role: Role) -> Comparison:
         """How the capture of the name of `new`, checked, compares with it."""
@@ -240,10 +255,19 @@ class Session(Decisions):
                         f"two captures are named {new.name!r}: rename one of their folders"
                     )
                 new_name(new.name, (*taken, *staged))
-                replace = force if isinstance(force, bool) else new.name in force
-                staged[new.name] = self._stage(
-                    new, role, None if board is None else str(board), replace
-                )
+                target = self._capture_folder(new.name)
+                replaces = force if isinstance(force, bool) else new.name in force
+                if target.exists() and not replaces:
+                    raise InputError(
+                        f"there is a capture {new.name!r} already: choose another name, or replace"
+                        " it with --force"
+                    )
+                if role not in get_args(Role):
+                    raise InputError(f"role {role!r} is unknown: use 'calibration' or 'scan'")
+                new.check()
+                with atomic.staged_folder(target, new.nbytes) as written:
+                    write_capture(written, new, role, None if board is None else str(board))
+                staged[new.name] = atomic.mark_complete(written)
                 del new  # before the next one is made
         except BaseException:
             for folder in staged.values():
@@ -281,17 +305,17 @@ class Session(Decisions):
         """Return what is in the trash and complete, the last deleted first."""
         return list_trash(self.folder / "trash")
 
+    def _place_of(self, entry: Trashed) -> Path:
+        """Return the place of a capture or result that is in the trash."""
+        return (self._capture_folder if entry.is_capture else self._result_folder)(entry.name)
+
     def restore(self, entries: Iterable[Trashed]) -> None:
         """Bring captures and results back from the trash, in one step; what has their names now
         takes their places."""
         self._require_writer()
         changes = atomic.Together(self.folder)
         for each in entries:
-            target = (
-                self._capture_folder(each.name)
-                if each.is_capture
-                else self._result_folder(each.name)
-            )
+            target = self._place_of(each)
             target.parent.mkdir(parents=True, exist_ok=True)
             changes.replace(target, each.place, self._trash_place(target))
         changes.commit()
@@ -304,7 +328,7 @@ class Session(Decisions):
             raise InputError(
                 f"there is no deleted {'result' if '/' in name else 'capture'} {name!r}"
             )
-        if (self._capture_folder if found.is_capture else self._result_folder)(name).exists():
+        if self._place_of(found).exists():
             raise InputError(f"there is a {name!r} again: delete that one first")
         self.restore([found])
 
@@ -408,7 +432,7 @@ class Session(Decisions):
         if self._together is None:
             atomic.move(folder, target)
         else:
-            self._together.move_away(folder, target)
+            self._together.replace(folder, None, target)
         return target
 
     def deleted_results(self) -> list[str]:
@@ -471,7 +495,7 @@ class Session(Decisions):
 
     # decisions and exports
 
-    def exclude(self, name: str, why: str) -> None:
+    def exclude(self, name: str, why: str = "by hand") -> None:
         """Exclude a capture from calibrations from now on, with the reason."""
         self.load_capture(name)
         self._decide("excluded", lambda: {**self.excluded(), name: why})
@@ -484,16 +508,19 @@ class Session(Decisions):
             folder.mkdir(exist_ok=True)
         return folder
 
+    def staged_export(self, name: str) -> AbstractContextManager[Path]:
+        """Context manager: as `staged_file`, of a file in the exports."""
+        return self.staged_file(self.exports / safe_name(name))
+
     @contextmanager
-    def staged_export(self, name: str) -> Iterator[Path]:
-        """Context manager: a path for a file that goes to the exports at the end, unless that fails
+    def staged_file(self, target: Path, needs_bytes: int = 0) -> Iterator[Path]:
+        """Context manager: a path for a file that goes to its place at the end, unless that fails
         or is given up."""
-        target = self.exports / safe_name(name)
-        with atomic.staged_folder(target, 0) as folder:
-            yield folder / name
+        with atomic.staged_folder(target, needs_bytes) as folder:
+            yield folder / target.name
             if self._allow is not None:
                 self._allow()
-            atomic.rename(folder / name, target)
+            atomic.rename(folder / target.name, target)
         atomic.discard(folder)
 
     # inside
@@ -526,22 +553,6 @@ class Session(Decisions):
             raise SessionError(f"{self.folder} is open for reading only: open it with write=True")
         if self._allow is not None:
             self._allow()
-
-    def _stage(self, capture: NewCapture, role: Role, board: str | None, force: bool) -> Path:
-        """Write a capture next to its place, and return the folder, which `atomic.commit`
-        renames."""
-        target = self._capture_folder(capture.name)
-        if target.exists() and not force:
-            raise InputError(
-                f"there is a capture {capture.name!r} already: choose another name, or replace it"
-                " with --force"
-            )
-        if role not in get_args(Role):
-            raise InputError(f"role {role!r} is unknown: use 'calibration' or 'scan'")
-        capture.check()
-        with atomic.staged_folder(target, capture.nbytes) as staged:
-            write_capture(staged, capture, role, board)
-        return atomic.mark_complete(staged)
 
     def _capture_folder(self, name: str) -> Path:
         """Return the folder of a capture; InputError for an unsafe name."""

@@ -32,7 +32,7 @@ from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import Row, median, row, run_python
 from slviewer.validation.proof import track
 from slviewer.validation.rendered_calibration import observe_rendered, scan_sequence
-from slviewer.wizard.planner import Planner
+from slviewer.wizard.pose_plan import Planner
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import RigView
 

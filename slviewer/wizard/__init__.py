@@ -7,13 +7,13 @@ threads do the work.
 `*_requests`          the requests, grouped by topic: methods of the state, which turn what they
                       raise into notices
 `engine`              the state behind them, and what a new snapshot requires
-`service`             a thread that serves until it is closed, which the following have
+`service`             what the threads of the following have in common, and their timing
 `acquisition`         one thread that owns camera and projector, and never computes
 `preview_watcher`     analyses the latest preview frame: board, brightness, stillness
 `jobs`                one worker that computes, one job after the other; each can be cancelled
                       within a second
 `session_reader`      reads poses, calibration and records from the session's files
-`planner`             computes where the board should be held next
+`pose_plan`           computes where the board should be held next
 `steps`               the nine steps, and what each is waiting for
 `snapshot`            what a panel draws; `publisher` builds and publishes it
 `autopilot`           runs the whole wizard on the simulated rig, by the same requests

@@ -1,13 +1,14 @@
 """The thread that owns camera and projector: it shows, grabs and saves, and computes nothing.
 
-Between captures it grabs previews and offers the latest one. A capture is saved by the request's
-own `save` before anything else happens, or it never existed. A fault ends the capture in which it
-happens, with a notice; the devices are then closed and opened again, every `retry_s` until they
+Between captures it grabs previews and offers the latest one. A capture is saved by its own
+`save` before anything else happens, or it never existed. A fault ends the capture in which it
+happens, with a notice; the devices are then closed, and opened again and again until they
 answer, and the preview goes on. Other work that needs the open devices, such as a check of the rig,
 is queued among the captures, and ends and fails as they do. A stream replaces the previews until
 anything else is requested.
 """
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from slviewer.devices.capture import CapturedFrames, capture_with_texture
+from slviewer.devices.capture import CapturedFrames, capture_with_texture, settle
 from slviewer.devices.protocols import (
     CameraSettings,
     Rig,
@@ -26,14 +27,12 @@ from slviewer.devices.protocols import (
 )
 from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableError
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.geometry.cuda_device import allocate_frames
 from slviewer.pipeline.feedback import Progress
-from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.notices import Notices, describe_failure
-from slviewer.wizard.service import Service
+from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import CaptureProgress, RigView
 
-RETRY_S = 2.0
-PREVIEWS_PER_S = 10.0
 STREAM_PREVIEWS_PER_S = 4.0  # the clouds matter more then
 _NOT_OPEN = "choose a rig first, and wait until its preview runs"
 LIGHTS = {"white": 255, "grey": 128, "dark": None}
@@ -45,24 +44,102 @@ _STREAM = "stream"  # what it shows during a stream
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class CaptureRequest:
-    """A request to capture: `save(captured)` writes it to disk, then `saved()` is called, on the
-    acquisition thread.
+@dataclass(eq=False)
+class LiveCapture:
+    """One short capture: frames (n, h, w), the time of its first frame by `time.monotonic`, and the
+    settings."""
 
-    The frames, of each of `exposures_ms` where there are any, are overwritten by the next capture.
+    frames: np.ndarray
+    begun: float
+    settings: CameraSettings
+
+
+class Stream:
+    """A pattern sequence that is captured repeatedly; a reader gets the newest complete capture.
+
+    `capture` is called by the thread that owns the devices, `wait_next` by one that reads, the
+    others by any. At most three buffers exist: one being filled, one waiting, and one being read.
+    `on_end` is called once, on the thread that ends it.
     """
 
-    name: str
-    sequence: PatternSequence
-    save: Callable[[CapturedFrames], None]
-    saved: Callable[[], None]
-    exposures_ms: tuple[float, ...] = ()
+    def __init__(self, sequence: PatternSequence, on_end: Callable[[], None]) -> None:
+        self.sequence, self._on_end = sequence, on_end
+        self._condition = threading.Condition()
+        self._free: list[np.ndarray] = []
+        self._waiting: LiveCapture | None = None
+        self._read: LiveCapture | None = None
+        self.has_ended = False
+        self.captured = 0
+        """Number of complete captures, including those that were not read."""
 
-    @property
-    def frames(self) -> int:
-        """The number of frames."""
-        return len(self.sequence.frames) * max(1, len(self.exposures_ms))
+    def capture(
+        self, rig: Rig, settings: CameraSettings, stopped: Callable[[], bool]
+    ) -> np.ndarray | None:
+        """Show and grab every frame of the sequence, which the rig's projector has loaded.
+
+        Returns a copy of the last frame (h, w), or None, and drops the capture, once `stopped()`.
+        Raises DeviceError.
+        """
+        count, (width, height) = len(self.sequence.frames), rig.camera.size
+        shape, dtype = (count, height, width), rig.camera.dtype
+        with self._condition:
+            frames = self._free.pop() if self._free else None
+        if frames is None or frames.shape != shape or frames.dtype != dtype:
+            frames = allocate_frames(shape, dtype)
+        begun = time.monotonic()
+        for k in range(count):
+            if stopped():
+                break
+            rig.projector.show(k)
+            settle(rig)
+            rig.camera.grab(frames[k])
+        else:
+            # a change during this exposure is reported at the next call
+            rig.projector.show(count - 1)
+            last = frames[-1].copy()
+            with self._condition:
+                self._recycle(self._waiting)  # it was not read
+                self._waiting = LiveCapture(frames, begun, settings)
+                self.captured += 1
+                self._condition.notify_all()
+            return last
+        with self._condition:
+            self._free.append(frames)
+        return None
+
+    def wait_next(self) -> LiveCapture | None:
+        """Wait for the newest capture that was not read yet, and return it; None once the stream
+        has ended.
+
+        Its frames stay valid until the next call.
+        """
+        with self._condition:
+            self._condition.wait_for(lambda: self.has_ended or self._waiting is not None)
+            if self.has_ended:
+                return None
+            self._recycle(self._read)
+            self._read, self._waiting = self._waiting, None
+            return self._read
+
+    def copy_latest(self) -> LiveCapture | None:
+        """Return a copy of the capture that was read last; None before the first."""
+        with self._condition:
+            if self._read is None:
+                return None
+            return LiveCapture(self._read.frames.copy(), self._read.begun, self._read.settings)
+
+    def end(self) -> None:
+        """End the stream: no further captures, and waiting readers get None."""
+        with self._condition:
+            first, self.has_ended = not self.has_ended, True
+            self._condition.notify_all()
+        if first:
+            self._on_end()
+
+    def _recycle(self, shot: LiveCapture | None) -> None:
+        """Return the buffer of a capture, if there is one, to the free list."""
+        if shot:
+            self._free.append(shot.frames)
 
 
 @dataclass(frozen=True)
@@ -70,8 +147,7 @@ class _Task:
     """Work with the open rig; `frames`: of a capture, 0 for other work."""
 
     name: str
-    work: Callable[[Rig, Progress], Any]
-    done: Callable[[Any], None]
+    work: Callable[[Rig, Progress], None]
     frames: int = 0
 
 
@@ -88,14 +164,12 @@ class Acquisition(Service):
         notices: Notices,
         changed: Callable[[], None],
         offer: Callable[[np.ndarray, int | None], None],
-        *,
-        retry_s: float = RETRY_S,
-        previews_per_s: float = PREVIEWS_PER_S,
+        timing: Timing,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("slviewer acquisition")
         self._notices, self._changed, self._offer = notices, changed, offer
-        self._retry_s, self._preview_s, self._clock = retry_s, 1 / previews_per_s, clock
+        self._timing, self._clock = timing, clock
         self._requests: deque[_Task] = deque()
         self._wanted: Rig | None = None
         self._settings: CameraSettings | None = None
@@ -106,38 +180,38 @@ class Acquisition(Service):
         # the thread's own:
         self._rig: Rig | None = None
         self._is_open = False
-        self._next_try = 0.0
-        self._next_preview = 0.0  # of a stream
+        self._next_try = self._next_preview = 0.0
         self._applied: CameraSettings | None = None
         self._shown: tuple[str, PatternSequence | None] | None = None
         self._buffer: np.ndarray | None = None
 
-    def use(self, rig: Rig | None, settings: CameraSettings | None = None) -> None:
-        """Use another rig, with these settings (its own where None), in white light; None: no rig.
+    def use(self, rig: Rig | None, settings: CameraSettings | None = None, fault: str = "") -> None:
+        """Use another rig, with these settings (its own where None), in white light; None: no rig,
+        for the reason that is its ``fault``.
 
         The previous rig is closed; its running capture is cancelled, and waiting ones are dropped.
         """
         with self._condition:
             self._wanted, self._settings = rig, settings
             dropped = [request.name for request in self._requests]
-            stream, self._stream = self._stream, None
             self._requests.clear()
             self._cancel = self._view.capture is not None
             self._light = ("white", None)  # a pattern is made for one projector
-            self._view = RigView(capture=self._view.capture)
+            self._view = RigView(
+                "lost" if fault else "none", fault=fault, capture=self._view.capture
+            )
             if rig:
                 self._view = replace(
                     self._view, state="opening", name=rig.name, camera=rig.camera.size,
                     projector=rig.projector.size,
                     turntable=rig.turntable.name if rig.turntable else "",
                 )  # fmt: skip
-            if rig and not self._thread.ident:
-                self._thread.start()
+                if not self._thread.ident:
+                    self._thread.start()
             self._condition.notify_all()
         for name in dropped:
             self._notices.add("info", f"{name}: not captured, another rig was chosen")
-        if stream:
-            stream.end()
+        self.stop_stream()
         self._changed()
 
     def set_camera(self, settings: CameraSettings) -> None:
@@ -160,23 +234,32 @@ class Acquisition(Service):
         """Show one of LIGHTS between captures, or the first frame of `pattern`."""
         with self._condition:
             self._light = (light, None if light in LIGHTS else pattern)
-            self._view = replace(self._view, light=light)
             self._condition.notify_all()
-        self._changed()
+        self._change_view(light=light)
 
-    def capture(self, request: CaptureRequest) -> None:
-        """Queue a capture. Raises DeviceError where no rig is open."""
+    def capture(
+        self,
+        name: str,
+        sequence: PatternSequence,
+        save: Callable[[CapturedFrames], object],
+        exposures_ms: tuple[float, ...] = (),
+    ) -> None:
+        """Queue a capture, in each of the exposures where there are any; `save(captured)` is called
+        with it, on this thread. Its frames are overwritten by the next one. Raises DeviceError
+        where no rig is open."""
+        frames = len(sequence.frames) * max(1, len(exposures_ms))
 
         def work(rig: Rig, _: Progress) -> None:
             """Capture the frames, and save them."""
-            out = self._get_buffer(rig, request.frames)
-            request.save(
-                capture_with_texture(
-                    rig, request.sequence, request.exposures_ms, out, self._report_frame
-                )
-            )
+            width, height = rig.camera.size
+            shape, dtype = (frames, height, width), rig.camera.dtype
+            out = self._buffer  # used again, to avoid page faults
+            if out is None or out.shape != shape or out.dtype != dtype:
+                out = self._buffer = None  # free it before the next one is allocated
+                out = self._buffer = np.empty(shape, dtype)
+            save(capture_with_texture(rig, sequence, exposures_ms, out, self._report_frame))
 
-        self._queue(_Task(request.name, work, lambda _: request.saved(), request.frames))
+        self._queue(_Task(name, work, frames))
 
     def run_task(
         self, name: str, task: Callable[[Rig, Progress], T], done: Callable[[T], None]
@@ -188,7 +271,7 @@ class Acquisition(Service):
         progress appears in `view().capture`, and raises Cancelled. What the task raises is reported
         like a capture's fault. Raises DeviceError where no rig is open.
         """
-        self._queue(_Task(name, task, done))
+        self._queue(_Task(name, lambda rig, progress: done(task(rig, progress))))
 
     def stream(self, stream: Stream) -> None:
         """Show and grab a stream repeatedly, in place of previews, until it is stopped.
@@ -243,9 +326,7 @@ class Acquisition(Service):
 
     def close(self) -> None:
         """End a running capture, close the devices and join the thread."""
-        with self._condition:
-            self._cancel = True
-            self._requests.clear()
+        self.cancel()
         self.stop_stream()
         super().close()
 
@@ -263,7 +344,6 @@ class Acquisition(Service):
     def _serve(self) -> None:
         """Run the acquisition loop until closing: change rigs, open devices, serve requests,
         stream, grab previews."""
-        next_preview = 0.0
         while True:
             with self._condition:
                 if self._closing:
@@ -284,21 +364,21 @@ class Acquisition(Service):
                     pass
                 elif request:
                     self._serve_request(rig, request)
-                    next_preview = 0.0
+                    self._next_preview = 0.0
                 elif not self._is_open:
                     if self._clock() >= self._next_try:
                         self._open_devices(rig)
                 elif stream:
                     self._serve_stream(rig, stream)
-                elif self._clock() >= next_preview:
-                    next_preview = self._clock() + self._preview_s
+                elif self._clock() >= self._next_preview:
+                    self._next_preview = self._clock() + 1 / self._timing.previews_per_s
                     self._grab_preview(rig)
             except Exception as error:
                 self._handle_fault(error)
-            self._wait_for_work(next_preview)
+            self._wait_for_work()
         self._close_devices()
 
-    def _wait_for_work(self, next_preview: float) -> None:
+    def _wait_for_work(self) -> None:
         """Wait until the next preview or opening attempt is due, or a request arrives; do not wait
         while streaming."""
         with self._condition:
@@ -306,14 +386,14 @@ class Acquisition(Service):
                 return
             if self._is_open and self._stream:
                 return
-            until = next_preview if self._is_open else self._next_try
-            pause = self._retry_s if self._rig is None else until - self._clock()
+            until = self._next_preview if self._is_open else self._next_try
+            pause = self._timing.retry_s if self._rig is None else until - self._clock()
             if pause > 0:
-                self._condition.wait(min(pause, self._retry_s))
+                self._condition.wait(min(pause, self._timing.retry_s))
 
     def _open_devices(self, rig: Rig) -> None:
         """Open the rig's devices and grab a first preview; report a lost rig that answers again."""
-        self._next_try = self._clock() + self._retry_s
+        self._next_try = self._clock() + self._timing.retry_s
         rig.open()
         self._is_open, self._applied, self._shown = True, None, None
         self._grab_preview(rig)  # devices that open and then do not answer are not ready
@@ -343,12 +423,10 @@ class Acquisition(Service):
             settings = self._settings
         if self._applied is None or settings != self._applied:
             actual = rig.camera.settings() if settings is None else rig.camera.apply(settings)
-            self._applied = settings
-            if settings is None:
-                self._applied = actual
-                with self._condition:
-                    # another thread may have set it meanwhile
-                    self._settings = self._settings or actual
+            self._applied = settings or actual
+            with self._condition:
+                # another thread may have set it meanwhile
+                self._settings = self._settings or actual
             notes = (
                 *list_notes(rig.camera),
                 *list_changed_settings(rig.camera, settings or actual, actual),
@@ -371,8 +449,7 @@ class Acquisition(Service):
             if self._shown != (_STREAM, stream.sequence):
                 rig.projector.load(stream.sequence)
                 self._shown = (_STREAM, stream.sequence)
-            view = self.view()
-            settings = CameraSettings(view.exposure_ms, view.gain)
+            settings = CameraSettings(**self.view().exposure)
             white = stream.capture(
                 rig, settings, lambda: bool(self._closing or self._stream is not stream)
             )
@@ -393,11 +470,7 @@ class Acquisition(Service):
             self._shown = None  # the task shows and sets its own from here on
             if not task.frames:
                 self._applied = None
-            task.done(
-                task.work(
-                    rig, lambda share, stage: self._report_frame(round(100 * share), 100, stage)
-                )
-            )
+            task.work(rig, lambda share, stage: self._report_frame(round(100 * share), 100, stage))
         except Cancelled:
             self._notices.add("info", f"{task.name}: cancelled")
         except SlviewerError as error:
@@ -406,19 +479,7 @@ class Acquisition(Service):
                 raise
             self._notices.add("error", f"{task.name}: {error}")
         finally:
-            with self._condition:
-                self._view = replace(self._view, capture=None)  # whichever rig is wanted by now
-            self._changed()
-
-    def _get_buffer(self, rig: Rig, count: int) -> np.ndarray:
-        """Return the frame buffer (count, h, w), reused between captures of one size to avoid page
-        faults."""
-        width, height = rig.camera.size
-        shape, dtype = (count, height, width), rig.camera.dtype
-        if self._buffer is None or self._buffer.shape != shape or self._buffer.dtype != dtype:
-            self._buffer = None  # free it before the next one is allocated
-            self._buffer = np.empty(shape, dtype)
-        return self._buffer
+            self._change_view(capture=None)  # whichever rig is wanted by now
 
     def _report_frame(self, frame: int, frames: int, stage: str = "") -> None:
         """Publish the progress of the running capture, or the percent of a task and its stage.
@@ -426,8 +487,7 @@ class Acquisition(Service):
         if self._cancel:
             raise Cancelled("cancelled")
         with self._condition:
-            now = self._view.capture
-            if now:
+            if now := self._view.capture:
                 progress = replace(now, frame=frame, frames=frames, stage=stage)
                 self._view = replace(self._view, capture=progress)
         self._changed()
@@ -440,15 +500,11 @@ class Acquisition(Service):
             first = not self._view.fault
             waiting = len(self._requests)
             self._requests.clear()
-            stream, self._stream = self._stream, None
-            if self._rig is self._wanted:
-                self._view = replace(self._view, state="lost", fault=text, capture=None)
+        self._update_view(state="lost", fault=text, capture=None)
         if first:
             dropped = f"; {waiting} waiting capture{'s' * (waiting > 1)} dropped" if waiting else ""
             self._notices.add("error", text + dropped)
-        if stream:
-            stream.end()
-        self._changed()
+        self.stop_stream()
 
     def _close_devices(self) -> None:
         """Close the open devices; what they raise is logged."""
@@ -464,4 +520,11 @@ class Acquisition(Service):
         with self._condition:
             if self._rig is self._wanted:
                 self._view = replace(self._view, **changes)
+        self._changed()
+
+    def _change_view(self, **changes: Any) -> None:
+        """Replace fields of the rig's view, and notify, without the lock: who is notified may hold
+        one of its own, and ask for the view."""
+        with self._condition:
+            self._view = replace(self._view, **changes)
         self._changed()

@@ -1,7 +1,6 @@
 """Runs the whole wizard on the simulated rig, by the same requests as an operator, to show it to a
 newcomer."""
 
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,13 +10,13 @@ import numpy as np
 from slviewer.devices.world import Thing
 from slviewer.errors import Cancelled, SlviewerError
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measure import MeasuredSurface, Place
 from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
 from slviewer.simulation.scenes import Scene, Spheres
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.snapshot import SessionView, Snapshot
+from slviewer.wizard.service import Service
+from slviewer.wizard.snapshot import Snapshot
 
 RIG = {"driver": "simulated", "preset": "letter", "scale": 0.5, "seed": 0}
 TARGET = "circles:21x16:9"
@@ -27,7 +26,7 @@ PATIENCE_S = 120.0
 """Time limit of one act."""
 
 
-class Autopilot:
+class Autopilot(Service):
     """Runs the whole wizard once. The snapshot names the current act; `before(act)` is called at
     the start of each.
 
@@ -43,27 +42,11 @@ class Autopilot:
         patience_s: float = PATIENCE_S,
         before: Callable[[str], None] = lambda act: None,
     ) -> None:
+        super().__init__("slviewer autopilot")
         self._operator, self._before, self._patience_s = operator, before, patience_s
         self._poses, self._pause_s = poses, pause_s
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(
-            target=self._run_and_report, name="slviewer autopilot", daemon=True
-        )
 
-    @property
-    def running(self) -> bool:
-        """Whether the autopilot's thread is alive."""
-        return self._thread.is_alive()
-
-    def start(self) -> None:
-        """Start the autopilot on a thread of its own."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Send no more requests; those under way are completed."""
-        self._stopped.set()
-
-    def _run_and_report(self) -> None:
+    def _serve(self) -> None:
         """Run all acts, and report completion, cancellation or failure as a notice."""
         try:
             self.run()
@@ -77,15 +60,15 @@ class Autopilot:
         """Do all acts on this thread. Raises Cancelled when stopped, SlviewerError with the notice
         of a failed act."""
         try:
-            self._operator.set_autopilot_status("Getting ready")
+            self._operator.show(autopilot="Getting ready")
             self._prepare()
             self._calibrate()
             self._verify()
             self._scan()
             self._measure()
-            self._perform_act("Writing the report", self._operator.report)
+            self._perform_act("Writing the report", self._operator.export, "report")
         finally:
-            self._operator.set_autopilot_status("")
+            self._operator.show(autopilot="")
 
     def _prepare(self) -> None:
         """Choose the simulated rig and the target, unless they are in use. Raises SlviewerError."""
@@ -94,23 +77,26 @@ class Autopilot:
             self._perform_act("Choosing the simulated rig", operator.choose_rig, RIG)
         if operator.wait_for(lambda s: s.rig.state == "open", self._patience_s) is None:
             raise SlviewerError("the simulated rig does not open")
-        if self._read_session().target != TARGET:
+        if self._wait_until_settled().content.target != TARGET:
             self._perform_act(f"Choosing the target {TARGET}", operator.choose_target, TARGET)
 
     def _calibrate(self) -> None:
         """Capture suggested poses until there are enough, then calibrate. Raises SlviewerError if
         too many fail."""
-        operator = self._operator
-        tried = 0
-        while (good := (now := self._read_session()).good_poses) < self._poses and not now.enough:
+        operator, tried = self._operator, 0
+        while not (now := self._wait_until_settled().content).enough:
+            if now.good_poses >= self._poses:
+                break
             tried += 1
             if tried > 2 * self._poses:
                 raise SlviewerError(
-                    f"only {good} of {tried} poses could be used: see why the others were refused"
+                    f"only {now.good_poses} of {tried} poses could be used: see why the others were"
+                    " refused"
                 )
             act = now.suggestion.sentence if now.suggestion else "Placing the board"
             self._perform_act(act, operator.place_at_suggestion)
-            self._perform_act(f"Capturing pose {good + 1} of {self._poses}", operator.capture_pose)
+            act = f"Capturing pose {now.good_poses + 1} of {self._poses}"
+            self._perform_act(act, operator.capture_pose)
         self._perform_act("Calibrating", operator.calibrate)
 
     def _verify(self) -> None:
@@ -137,9 +123,18 @@ class Autopilot:
         """Measure the sphere's radius and the object's width."""
         operator = self._operator
         sphere, latest = self._list_scans("sphere")[-1], self._list_scans("scan")[-1]
-        region = _make_ball_region(operator.surface(sphere))
+        on = operator.surface(sphere)
+        # a ball around the point nearest to the camera, its radius half the measured extent
+        z = np.where(on.measured, on.points[..., 2], np.inf)
+        top = on.points[np.unravel_index(int(np.argmin(z)), z.shape)]
+        away = np.linalg.norm(on.points[on.measured] - top, axis=-1)
+        region = Region.ball(top, 0.5 * float(np.percentile(away, 95)))
         self._perform_act("Measuring the sphere", operator.measure, sphere, "sphere", region=region)
-        ends = _select_width_ends(operator.surface(latest))
+        # the ends of the row of the image with the most measured points
+        measured = operator.surface(latest).measured
+        v = int(np.argmax(measured.sum(axis=1)))
+        columns = np.flatnonzero(measured[v])
+        ends = (int(columns[0]), v), (int(columns[-1]), v)
         self._perform_act(
             "Measuring the width of the object", operator.measure, latest, "distance", ends
         )
@@ -159,51 +154,34 @@ class Autopilot:
     ) -> None:
         """Send one request and wait until all its work has ended. Raises SlviewerError with the
         notice of a failure."""
-        self._operator.set_autopilot_status(act)
+        self._operator.show(autopilot=act)
         self._before(act)
-        if self._stopped.wait(self._pause_s):
-            raise Cancelled("autopilot was stopped")
+        with self._condition:
+            if self._condition.wait_for(lambda: self._closing, self._pause_s):
+                raise Cancelled("autopilot was stopped")
         last = max((notice.number for notice in self._operator.snapshot().notices), default=0)
         request(*args, **options)
         for notice in self._wait_until_settled().notices:
             if notice.number > last and notice.level == "error":
                 raise SlviewerError(f"{act}: {notice.text}")
 
-    def _read_session(self) -> SessionView:
-        """Return the session once no work runs. Raises SlviewerError where none is open."""
-        session = self._wait_until_settled().session
-        if session is None:
-            raise SlviewerError("no session is open: open or create one first")
-        return session
-
     def _list_scans(self, purpose: str) -> list[str]:
         """List the names of captures made for a purpose: scan, plane or sphere."""
-        return [scan.name for scan in self._read_session().scans if scan.purpose == purpose]
+        return [
+            scan.name
+            for scan in self._wait_until_settled().content.scans
+            if scan.purpose == purpose
+        ]
 
     def _wait_until_settled(self) -> Snapshot:
         """Wait until no work runs; returns the snapshot. Raises Cancelled when stopped,
         SlviewerError on timeout."""
         end = time.monotonic() + self._patience_s
         while True:
-            if self._stopped.is_set():
+            if self._closing:
                 raise Cancelled("autopilot was stopped")
             try:
                 return self._operator.wait_until_idle(0.5)
             except SlviewerError:
                 if time.monotonic() > end:
                     raise
-
-
-def _make_ball_region(on: MeasuredSurface) -> Region:
-    """Return a ball around the point nearest to the camera, its radius half the measured extent."""
-    z = np.where(on.measured, on.points[..., 2], np.inf)
-    top = on.points[np.unravel_index(int(np.argmin(z)), z.shape)]
-    away = np.linalg.norm(on.points[on.measured] - top, axis=-1)
-    return Region.ball(top, 0.5 * float(np.percentile(away, 95)))
-
-
-def _select_width_ends(on: MeasuredSurface) -> tuple[Place, Place]:
-    """Return the two end pixels (u, v) of the image row with the most measured points."""
-    v = int(np.argmax(on.measured.sum(axis=1)))
-    columns = np.flatnonzero(on.measured[v])
-    return (int(columns[0]), v), (int(columns[-1]), v)

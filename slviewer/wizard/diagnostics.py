@@ -10,6 +10,7 @@ import platform
 import sys
 import zipfile
 from collections import deque
+from collections.abc import Iterator
 from contextlib import suppress
 from datetime import datetime
 from typing import Any
@@ -18,11 +19,10 @@ import cv2
 
 from slviewer import __version__
 from slviewer.errors import SessionError, hide_passwords
+from slviewer.pipeline.operation import Job
 from slviewer.session.atomic import to_json
 from slviewer.session.reading import MAX_JSON_BYTES, read_file
-from slviewer.session.store import Session
-from slviewer.wizard.jobs import Reporter
-from slviewer.wizard.snapshot import PreviewView, Snapshot
+from slviewer.wizard.snapshot import PoseView, PreviewView, ScanView, Snapshot
 
 LINES = 4000
 PACKAGES = (
@@ -62,71 +62,67 @@ class LogKeeper(logging.Handler):
         super().close()
 
 
-def write_bundle(
-    session: Session,
-    snapshot: Snapshot,
-    preview: PreviewView | None,
-    log: LogKeeper,
-    report: Reporter,
-) -> str:
-    """Write ``diagnostics_<time>.zip`` into the exports; returns its name."""
+def write_bundle(job: Job, snapshot: Snapshot, preview: PreviewView | None, log: LogKeeper) -> str:
+    """Write ``diagnostics_<time>.zip`` into the exports; returns a sentence that begins with its
+    name."""
     name = f"diagnostics_{datetime.now():%Y%m%d_%H%M%S}.zip"
-    guarded = session.guarded(report.saving)
     with (
-        guarded.staged_export(name) as path,
+        job.store.staged_export(name) as path,
         zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle,
     ):
-        report(0.1, "versions and settings")
-        bundle.writestr("versions.json", to_json(_collect_versions()))
-        state = {
-            "rig": snapshot.rig,
-            "steps": snapshot.steps,
-            "notices": [
-                [each.time.isoformat(), each.level, each.text] for each in snapshot.notices
-            ],
-            "space": snapshot.space,
-        }
-        bundle.writestr("state.json", hide_passwords(to_json(state).decode()))
-        bundle.writestr("log.txt", "\n".join(log.lines) + "\n")
-        for file in ("session.json", "decisions.json"):
-            # whatever it holds: a damaged one may be the reason for the report
-            with suppress(OSError):
-                content = read_file(session.folder / file, MAX_JSON_BYTES)
-                bundle.writestr(f"session/{file}", hide_passwords(content.decode(errors="replace")))
-        report(0.4, "captures and results")
-        for capture in session.captures():
-            described = {key: value for key, value in capture.meta.items() if key != "sequence"}
-            bundle.writestr(
-                f"session/captures/{capture.name}.json", hide_passwords(to_json(described).decode())
-            )
-        for result in session.result_names():
-            try:
-                described = session.load_result(result, only=())[0]
-            except SessionError as error:
-                described = {"damaged": str(error)}
-            bundle.writestr(f"session/results/{result}.json", to_json(described))
-        report(0.8, "previews")
-        if snapshot.session:
-            thumbnails = {pose.name: pose.thumbnail for pose in snapshot.session.poses}
-            thumbnails |= {scan.name: scan.thumbnail for scan in snapshot.session.scans}
-            for each, jpeg in thumbnails.items():
-                bundle.writestr(f"previews/{each}.jpg", jpeg)
+        for entry, content in _collect(job, snapshot, log):
+            text = content if isinstance(content, str) else to_json(content).decode()
+            bundle.writestr(entry, hide_passwords(text))
+        job.progress(0.8, "previews")
+        views: list[PoseView | ScanView] = [*snapshot.content.poses, *snapshot.content.scans]
+        for view in views:
+            bundle.writestr(f"previews/{view.name}.jpg", view.thumbnail)
         if preview:
             bundle.writestr("previews/now.jpg", bytes(cv2.imencode(".jpg", preview.image)[1]))
-    report(1.0, "collected")
-    return name
+    job.progress(1.0, "collected")
+    return f"{name} is ready to download"
 
 
-def _collect_versions() -> dict[str, Any]:
-    """Return the versions of slviewer, Python, the operating system and the installed packages."""
-    versions = {}
+def _collect(job: Job, snapshot: Snapshot, log: LogKeeper) -> Iterator[tuple[str, Any]]:
+    """Yield the name of each entry and its content, as text or as plain values."""
+    session, versions = job.store, {}
+    job.progress(0.1, "versions and settings")
     for package in PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-    return {
-        "slviewer": __version__,
-        "python": sys.version,
-        "system": platform.platform(),
-        "processors": os.cpu_count(),
-        "packages": versions,
-    }
+    yield (
+        "versions.json",
+        {
+            "slviewer": __version__,
+            "python": sys.version,
+            "system": platform.platform(),
+            "processors": os.cpu_count(),
+            "packages": versions,
+        },
+    )
+    notices = [[each.time.isoformat(), each.level, each.text] for each in snapshot.notices]
+    yield (
+        "state.json",
+        {
+            "rig": snapshot.rig,
+            "steps": snapshot.steps,
+            "notices": notices,
+            "space": snapshot.space,
+        },
+    )
+    yield "log.txt", "\n".join(log.lines) + "\n"
+    for file in ("session.json", "decisions.json"):
+        # whatever it holds: a damaged one may be the reason for the report
+        with suppress(OSError):
+            content = read_file(session.folder / file, MAX_JSON_BYTES)
+            yield f"session/{file}", content.decode(errors="replace")
+    job.progress(0.4, "captures and results")
+    for capture in session.captures():
+        described = {key: value for key, value in capture.meta.items() if key != "sequence"}
+        yield f"session/captures/{capture.name}.json", described
+    for result in session.result_names():
+        try:
+            described = session.load_result(result, only=())[0]
+        except SessionError as error:
+            described = {"damaged": str(error)}
+        yield f"session/results/{result}.json", described

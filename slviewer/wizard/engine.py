@@ -9,43 +9,43 @@ raising.
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from slviewer.calibration import guidance
 from slviewer.calibration.observe import Observation, Smoothing
-from slviewer.errors import DamagedError, InputError, SessionError, SlviewerError
+from slviewer.devices.world import SimulatedWorld
+from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.pipeline.capture import Space, measure_space, warn_of_captured
 from slviewer.pipeline.examination import load_examination, load_or_save_examination
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.models import accepts_rejected
-from slviewer.pipeline.operation import Findings, Operation
+from slviewer.pipeline.operation import Findings, Job, Operation
 from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.wizard import acquisition, preview_watcher
+from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.diagnostics import LogKeeper
 from slviewer.wizard.jobs import Jobs, Reporter
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.notices import Notices, describe_failure
-from slviewer.wizard.planner import Planner
-from slviewer.wizard.pose_plan import plan_next_pose
+from slviewer.wizard.pose_plan import Planner
+from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
 from slviewer.wizard.publisher import Listeners, Publisher
 from slviewer.wizard.result_views import make_thumbnail
+from slviewer.wizard.service import Timing
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import (
-    Brightness,
     PreviewView,
     RigView,
     SessionView,
     Snapshot,
     WorldView,
 )
-from slviewer.wizard.steps import Facts, views
+from slviewer.wizard.steps import views
 
 READ_ATTEMPTS = 20
 """Snapshots in a row that may meet the session's files in the middle of a change."""
@@ -54,23 +54,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Handler = TypeVar("Handler", bound="Engine")
 Request = Callable[Concatenate[Any, P], bool]
-
-
-@dataclass(frozen=True)
-class Timing:
-    """How often the wizard repeats what it does by itself, and how much it computes each time.
-
-    ``retry_s``: s between two attempts to open devices, or to read files that could not be read.
-    ``previews_per_s``: rate of the camera preview. ``trials``: candidates of the next pose whose
-    gain is computed. ``hold_s``: s for which a board is held still before the hands-free countdown
-    starts, which takes ``count_s``.
-    """
-
-    retry_s: float = acquisition.RETRY_S
-    previews_per_s: float = acquisition.PREVIEWS_PER_S
-    trials: int = guidance.TRIALS
-    hold_s: float = preview_watcher.HOLD_S
-    count_s: float = preview_watcher.COUNT_S
 
 
 def request(action: str) -> Callable[[Callable[Concatenate[Handler, P], None]], Request[P]]:
@@ -97,6 +80,17 @@ def request(action: str) -> Callable[[Callable[Concatenate[Handler, P], None]], 
     return decorate
 
 
+def on_session(action: str, function: Callable[Concatenate[Session, P], object]) -> Request[P]:
+    """Return the request that a function of the open session answers."""
+
+    @request(action)
+    def handle(self: Engine, *args: P.args, **kwargs: P.kwargs) -> None:
+        """Call the function with the session."""
+        function(self._store, *args, **kwargs)
+
+    return handle
+
+
 class Engine:
     """The state behind the requests. `capture_now` is called, on the preview's thread, for a
     hands-free capture."""
@@ -109,34 +103,28 @@ class Engine:
         self._preview_listeners = Listeners[PreviewView]()
         self._live: LiveScan | None = None  # the last one, whether it runs or not
         self._live_listeners = Listeners[LiveCloud]()
-        self._hands_free = preview_watcher.HandsFree(timing.hold_s, timing.count_s)
+        self._hands_free = HandsFree(timing)
         self._bench: RigSetup | None = None
         self._choice: Choice | None = None
-        self._rig_fault = ""  # why the chosen rig could not even be set up
         self._session_reader: SessionReader | None = None
         # captures by name and content hash, and the target
         self._queued: set[tuple[str, str, str]] = set()
-        self._brightness: Brightness = ""
         # the publisher's thread alone writes these:
         # a session, and whether its poses were enough
         self._reached: tuple[Path | None, bool] = (None, False)
         self._failed_reads, self._reported_faults = 0, set[str]()
         # what later snapshots show beside what is read for each
-        self._shown = Snapshot(steps=views(Facts()))
+        self._shown = Snapshot(steps=views(Snapshot()))
         self._publisher = Publisher(self._build_snapshot, self._shown, timing.retry_s)
         changed = self._publisher.mark_changed
         self._notices = Notices(changed)
-        self._jobs = Jobs(self._notices, changed)
-        compute = partial(plan_next_pose, trials=timing.trials)
-        self._planner = Planner(self._note_change, compute)
-        self._watcher = preview_watcher.Watcher(self._handle_preview)
-        self._acquisition = acquisition.Acquisition(
-            self._notices,
-            changed,
-            self._watcher.offer,
-            retry_s=timing.retry_s,
-            previews_per_s=timing.previews_per_s,
-        )
+        self._jobs = Jobs(self._notices, changed, self._note_change)
+        self._planner = Planner(self._note_change, timing.trials)
+        self._watcher = Watcher(self._handle_preview)
+        self._acquisition = Acquisition(self._notices, changed, self._watcher.offer, timing)
+        # what others ask of the parts
+        self.wait_for, self.subscribe_live = self._publisher.wait_for, self._live_listeners.add
+        self.notify, self.notices = self._notices.add, self._notices.all
         self._publisher.listeners.add(self._follow_up)
         self._publisher.start()
 
@@ -145,6 +133,11 @@ class Engine:
         """The open session, to be read by `result_views`; None where none is open."""
         reader = self._session_reader
         return None if reader is None else reader.session
+
+    @property
+    def _scene(self) -> SimulatedWorld | None:
+        """The scene of the simulated rig; None where another or none is chosen."""
+        return self._bench.world if self._bench else None
 
     @property
     def _reader(self) -> SessionReader:
@@ -178,7 +171,7 @@ class Engine:
         """Request a snapshot: the session's files have changed."""
         self._publisher.mark_changed(session=True)
 
-    def _show(self, **changes: Any) -> None:
+    def show(self, **changes: Any) -> None:
         """Change fields of the next snapshots."""
         with self._lock:
             self._shown = replace(self._shown, **changes)
@@ -190,31 +183,32 @@ class Engine:
         """Return a function that adds a warning to the notices, with its section of the help."""
         return lambda text: self._notices.add("warning", text, section)
 
-    def _submit(
+    def _work(
         self,
-        name: str,
-        work: Callable[[Reporter], T],
-        describe: Callable[[T], str],
+        title: str,
+        work: Callable[[Job], Findings[Any] | str],
+        section: str = "",
         failed: Callable[[BaseException], None] | None = None,
     ) -> None:
-        """Queue a job; `describe(result)` becomes a notice, and `failed(error)` replaces the notice
-        of a failure."""
+        """Queue work on the session, which no longer saves once it was cancelled; what it returns
+        becomes a notice, and `failed(error)` replaces that of a failure. ``section``: of the help,
+        of warnings."""
+        store, warn = self._store, self._warner(section)
 
-        def done(result: T) -> None:
-            """Add the description of the result to the notices, and mark the session as changed."""
-            is_good = not isinstance(result, Findings) or all(
-                each.is_good for each in result.values()
-            )
-            if text := describe(result):
+        def done(found: Findings[Any] | str) -> None:
+            """Add what the work found to the notices."""
+            if isinstance(found, str):
+                self._notices.add("good", found)
+            elif text := found.summary():
+                is_good = all(each.is_good for each in found.values())
                 self._notices.add("good" if is_good else "warning", text)
-            self._note_change()
 
-        def end_badly(error: BaseException) -> None:
-            """Report why the job failed; what it has saved before is to be seen."""
-            (failed or partial(self._notices.add_failure, name))(error)
-            self._note_change()
-
-        self._jobs.submit(name, work, done, failed=end_badly)
+        self._jobs.submit(
+            title,
+            lambda report: work(Job(store.guarded(report.saving), report, warn)),
+            done,
+            failed=failed,
+        )
 
     def _run(
         self,
@@ -224,21 +218,17 @@ class Engine:
         section: str = "",
         failed: Callable[[BaseException], None] | None = None,
     ) -> None:
-        """Queue an operation on the session; the summary of what it found becomes a notice.
+        """Queue an operation as `_work`. A calibration that the operator uses although it was
+        rejected is used."""
 
-        A calibration that the operator uses although it was rejected is used. ``section``: of the
-        help, of warnings.
-        """
-        store, warn = self._store, self._warner(section)
-
-        def work(report: Reporter) -> Findings[Any]:
-            """Run the operation, which no longer saves once the job was cancelled."""
+        def work(job: Job) -> Findings[Any]:
+            """Run the operation."""
             used = settings
-            if accepts_rejected(store) and hasattr(settings, "accept_rejected"):
+            if accepts_rejected(job.store) and hasattr(settings, "accept_rejected"):
                 used = replace(settings, accept_rejected=True)
-            return operation.run(store.guarded(report.saving), used, report, warn)
+            return operation.run(job.store, used, job.progress, job.warn)
 
-        self._submit(title, work, Findings.summary, failed)
+        self._work(title, work, section, failed)
 
     # the background
 
@@ -257,8 +247,6 @@ class Engine:
             self._jobs.submit(
                 f"Processing {capture.name}",
                 partial(self._process_capture, reader, capture),
-                lambda _: self._note_change(),
-                failed=partial(self._handle_processing_failure, reader, capture),
                 background=True,
             )
 
@@ -267,20 +255,24 @@ class Engine:
         target pose."""
         if capture.name not in reader.session.capture_names():
             return  # deleted since
-        if capture.hash not in reader.thumbnails:
-            reader.thumbnails[capture.hash] = make_thumbnail(capture)
-            self._note_change()
-        session = reader.session.guarded(report.saving)
-        report(0.0, f"reading {capture.name}")
-        is_new = load_examination(session, capture.name) is None
         try:
-            if reader.needs_judging(capture, reader.target()):
-                self._judge_pose(reader, session, capture)
-        finally:
-            if is_new:
-                for sentence in load_or_save_examination(session, capture).warnings():
-                    self._warner("frames")(f"{capture.name}: {sentence}")
-                warn_of_captured(capture.name, capture, self._warner("check-exposure"))
+            if capture.hash not in reader.thumbnails:
+                reader.thumbnails[capture.hash] = make_thumbnail(capture)
+                self._note_change()
+            session = reader.session.guarded(report.saving)
+            report(0.0, f"reading {capture.name}")
+            is_new = load_examination(session, capture.name) is None
+            try:
+                if reader.needs_judging(capture, reader.target()):
+                    self._judge_pose(reader, session, capture)
+            finally:
+                if is_new:
+                    for sentence in load_or_save_examination(session, capture).warnings():
+                        self._warner("frames")(f"{capture.name}: {sentence}")
+                    warn_of_captured(capture.name, capture, self._warner("check-exposure"))
+        except (InputError, DamagedError) as error:
+            reader.unreadable[capture.name, capture.hash, reader.target()] = str(error)
+            raise
 
     def _judge_pose(self, reader: SessionReader, session: Session, capture: Capture) -> None:
         """Read the features of a target pose, examine its frames, and save both; the next pose is
@@ -298,16 +290,6 @@ class Engine:
         judged = next(poses)
         if judged.observation is None:
             self._warner("target-poses")(f"{capture.name} cannot be used: {judged.refused}")
-        self._note_change()
-
-    def _handle_processing_failure(
-        self, reader: SessionReader, capture: Capture, error: BaseException
-    ) -> None:
-        """Report that a capture could not be processed, and store why it is unreadable."""
-        self._notices.add_failure(f"Processing {capture.name}", error)
-        if isinstance(error, InputError | DamagedError):
-            reader.add_unreadable(capture, str(error))
-        self._note_change()
 
     # previews
 
@@ -322,28 +304,25 @@ class Engine:
         if now:
             self._capture_now()
         brightness = view.brightness if self._acquisition.view().light == "white" else ""
-        if brightness != self._brightness:
-            self._brightness = brightness
-            self._publisher.mark_changed()
+        if brightness != self._shown.brightness:
+            self.show(brightness=brightness)
         self._preview_listeners.call(view)
 
     # snapshots
 
     def _build_snapshot(self, version: int, session_changed: bool) -> Snapshot:
         """Build the current snapshot without changing any state (publisher's thread)."""
-        reader, bench, choice = self._session_reader, self._bench, self._choice
+        reader, choice = self._session_reader, self._choice
         rig = self._acquisition.view()
         session, space, read_failure = None, None, ""
         if reader:
             session, space, read_failure = self._read_session(reader, rig, session_changed)
-        if self._rig_fault:
-            rig = replace(rig, state="lost", fault=self._rig_fault)
-        world = bench.world if bench else None
+        world = self._scene
         rig = replace(
             rig, simulated=world is not None, choice=choice, pages=list_needed_pages(choice or {})
         )
         live = self._live
-        return replace(
+        now = replace(
             self._shown,
             version=version,
             session=session,
@@ -353,12 +332,12 @@ class Engine:
             else WorldView(world.standing, world.pose.matrix, world.turn_deg),
             job=self._jobs.view(),
             notices=self._notices.all(),
-            steps=views(Facts(session, rig, space, self._brightness)),
             space=space,
             hands_free=self._hands_free.is_on,
             live=live.figures() if live and live.is_running else None,
             read_failure=read_failure,
         )
+        return replace(now, steps=views(now))
 
     def _read_session(
         self, reader: SessionReader, rig: RigView, changed: bool
@@ -366,28 +345,22 @@ class Engine:
         """Return (the session, its space, why reading failed); a session that cannot be read stays
         as it was."""
         before, bench, space = self._publisher.latest, self._bench, None
-        session, failure = before.session, before.read_failure
+        session, failure = before.session, "" if changed else before.read_failure
         if session is None or session.folder != reader.session.folder:
-            session, changed = None, True
+            session, failure, changed = None, "", True
         try:
             if changed:
-                failure = ""
                 session = reader.read(rig, bench.focal_px if bench else None)
-        except Exception as error:  # most likely files were being changed
-            failure = describe_failure("Reading the session", error)
-        try:
             camera = bench.rig.camera if bench and rig.camera is not None else None
             space = measure_space(reader.session, camera, reader.count_frames(rig))
-        except (SlviewerError, OSError) as error:
+        except Exception as error:  # most likely files were being changed
             failure = failure or describe_failure("Reading the session", error)
         return session, space, failure
 
     def _follow_up(self, snapshot: Snapshot) -> None:
         """Act on a new snapshot: retry failed reads, plan the next pose, end hands-free capture."""
-        session = snapshot.session
-        faults = (
-            (snapshot.read_failure,) if snapshot.read_failure else session.faults if session else ()
-        )
+        session = snapshot.content
+        faults = (snapshot.read_failure,) if snapshot.read_failure else session.faults
         new_faults = [fault for fault in faults if fault not in self._reported_faults]
         self._reported_faults &= set(faults)
         self._failed_reads = self._failed_reads + 1 if new_faults else 0
@@ -397,13 +370,11 @@ class Engine:
             self._reported_faults |= set(new_faults)
             for fault in new_faults:
                 self._notices.add("error", fault)
-        watch = preview_watcher.Watch()
-        if session and session.target:
+        watch = Watch()
+        if session.target:
             lens = session.plan.lens if session.plan else None
-            watch = preview_watcher.Watch(Board.parse(session.target), lens)
+            watch = Watch(Board.parse(session.target), lens)
         self._watcher.watch = watch
-        if session is None:
-            return
         if session.pending_plan:
             self._planner.request(session.pending_plan)
             return

@@ -19,11 +19,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from slviewer.errors import Cancelled
-from slviewer.wizard.notices import Notices, log
-from slviewer.wizard.service import Service
+from slviewer.wizard.notices import Notices
+from slviewer.wizard.service import Service, log
 from slviewer.wizard.snapshot import JobView
 
 PATIENCE_S = 0.5
@@ -53,14 +54,10 @@ class Reporter:
         if share < 1:  # with the last report everything is saved
             with self._lock:
                 self._saving = False
-            self.check()
+                if self.cancelled:
+                    raise Cancelled("cancelled")
         self.share, self.stage = min(max(float(share), 0.0), 1.0), stage
         self._changed()
-
-    def check(self) -> None:
-        """Raise Cancelled if the work was cancelled."""
-        if self.cancelled:
-            raise Cancelled("cancelled")
 
     def saving(self) -> None:
         """Mark the start of a save: raises Cancelled, or defers cancelling until the next
@@ -100,11 +97,13 @@ class _Job:
 
 class Jobs(Service):
     """A worker thread with a foreground and a background queue. Every method may be called from any
-    thread."""
+    thread. `ended()` is called after each job, whatever became of it."""
 
-    def __init__(self, notices: Notices, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, notices: Notices, changed: Callable[[], None], ended: Callable[[], None]
+    ) -> None:
         super().__init__("slviewer worker")
-        self._notices, self._changed = notices, changed
+        self._notices, self._changed, self._ended = notices, changed, ended
         self._waiting: list[_Job] = []
         self._running: _Job | None = None
         self._thread.start()
@@ -133,13 +132,16 @@ class Jobs(Service):
 
     def cancel(self) -> None:
         """Cancel the running foreground job, else the first waiting one; other jobs continue."""
+        dropped = list[_Job]()
         with self._condition:
             if self._running and not self._running.background:
                 self._running.reporter.cancel()
                 self._condition.notify_all()
-            elif requested := [job for job in self._waiting if not job.background]:
-                self._waiting.remove(requested[0])
-                self._notices.add("info", f"{requested[0].name}: cancelled")
+            else:
+                dropped = [job for job in self._waiting if not job.background][:1]
+                self._waiting = [job for job in self._waiting if job not in dropped]
+        for job in dropped:
+            self._notices.add("info", f"{job.name}: cancelled")
         self._changed()
 
     def cancel_all(self) -> None:
@@ -187,7 +189,7 @@ class Jobs(Service):
             with self._condition:
                 self._running = None
                 self._condition.notify_all()
-            self._changed()
+            self._ended()
             with self._condition:
                 self._condition.wait_for(lambda: self._closing or self._waiting)
                 if self._closing:
@@ -226,10 +228,8 @@ class Jobs(Service):
         ):
             if not job.background:
                 self._notices.add("info", f"{job.name}: cancelled")
-        elif job.error and job.failed:
-            job.failed(job.error)
         elif job.error:
-            self._notices.add_failure(job.name, job.error)
+            (job.failed or partial(self._notices.add_failure, job.name))(job.error)
         elif job.done:
             job.done(job.result)
 

@@ -5,7 +5,6 @@ The devices' thread fills a `Stream`, and a thread of the live scan computes the
 the listeners, which must return at once. Nothing is saved unless the operator saves it.
 """
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -31,11 +30,11 @@ from slviewer.reconstruction.onepass import OnePass, PassResult
 from slviewer.reconstruction.onepass_cuda import has_pass, one_pass
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.session.store import Session
-from slviewer.wizard.acquisition import Acquisition
+from slviewer.wizard.acquisition import Acquisition, Stream
 from slviewer.wizard.jobs import release_memory
-from slviewer.wizard.live_frames import LiveCapture, Stream
 from slviewer.wizard.live_motion import mask_motion
 from slviewer.wizard.notices import Notices
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import LiveView
 
 REPORTS_PER_S = 3.0
@@ -108,7 +107,7 @@ class LiveModel:
         return points, np.array(to_eight_bits(frames[-1], self.sequence.full_scale))
 
 
-class LiveScan:
+class LiveScan(Service):
     """A live scan, from its start to its end.
 
     `publish(cloud)` is called with every cloud on the scan's own thread, `changed()` when figures
@@ -125,10 +124,10 @@ class LiveScan:
         publish: Callable[[LiveCloud], None],
         changed: Callable[[], None],
     ) -> None:
+        super().__init__("slviewer live")
         self._store, self.axis, self._acquisition, self._notices = store, axis, acquisition, notices
         self._publish, self._changed = publish, changed
         self.stream = Stream(sequence, changed)
-        self._lock = threading.Lock()
         # time and latency, s, of the latest clouds
         self._made: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
         self._sent: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
@@ -136,7 +135,6 @@ class LiveScan:
         self._model: LiveModel | None = None  # of the calibration of this key, checked at that time
         self._key: tuple[object, ...] = ()
         self._loaded = 0.0
-        self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
 
     def start(self) -> None:
         """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a
@@ -154,13 +152,13 @@ class LiveScan:
     def count_shown(self, cloud: LiveCloud) -> None:
         """Record that a cloud was sent to the browsers, for rate and latency."""
         now = time.monotonic()
-        with self._lock:
+        with self._condition:
             self._sent.append((now, now - cloud.begun))
 
     def figures(self) -> LiveView:
         """Return the rates and the median latency of the last seconds."""
         now = time.monotonic()
-        with self._lock:
+        with self._condition:
             rates = _compute_rate(self._made, now), _compute_rate(self._sent, now)
             late_s = [late for _, late in self._sent]
             return LiveView(
@@ -173,30 +171,25 @@ class LiveScan:
         released = time.monotonic()
         while (shot := self.stream.wait_next()) is not None:
             try:
-                cloud = self._compute_cloud(shot)
+                points, texture = self._load_model().cloud(shot.frames)
             except Exception as error:
                 self._notices.add_failure("Live", error)
                 self._acquisition.stop_stream()
                 return
             now = time.monotonic()
-            with self._lock:
+            with self._condition:
                 self._made.append((now, now - shot.begun))
+                self._number += 1
+                self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
             if not self.is_running:
                 return
-            self._publish(cloud)
+            self._publish(LiveCloud(self._number, points, texture, shot.begun))
             if now - self._reported > 1 / REPORTS_PER_S:
                 self._reported = now
                 self._changed()
             if now - released > _RELEASE_S:
                 released = now
                 release_memory()
-
-    def _compute_cloud(self, shot: LiveCapture) -> LiveCloud:
-        """Reconstruct a capture with the current calibration."""
-        points, texture = self._load_model().cloud(shot.frames)
-        self._number += 1
-        self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
-        return LiveCloud(self._number, points, texture, shot.begun)
 
     def _load_model(self) -> LiveModel:
         """Return the model, checked for changes at most a second ago. Raises SlviewerError where

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from datetime import datetime
 
 from slviewer.errors import SlviewerError, hide_passwords
+from slviewer.wizard.service import log
 from slviewer.wizard.snapshot import Level, Notice
-
-log = logging.getLogger("slviewer.wizard")
 
 MOST_NOTICES = 100
 
@@ -26,11 +25,7 @@ class Notices:
     def add(self, level: Level, text: str, section: str = "") -> None:
         """Add a notice and log it, without passwords; `section`: of the help's page of findings."""
         text = hide_passwords(text)
-        log.log(
-            {"warning": logging.WARNING, "error": logging.ERROR}.get(level, logging.INFO),
-            "%s",
-            text,
-        )
+        log.log(logging.getLevelNamesMapping().get(level.upper(), logging.INFO), "%s", text)
         with self._lock:
             self._count += 1
             self._latest.append(

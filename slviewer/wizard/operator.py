@@ -2,38 +2,59 @@
 
 A request that cannot be granted becomes a notice, and returns False. Devices are used on the
 acquisition thread and the worker computes, so that requests may come from any thread, a browser's
-callbacks too.
+callbacks too. Captures are requested here: of the target, of objects, planes and spheres, in short
+and in live scans, on a turntable, and from files.
 """
 
+import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Literal
 
+from slviewer.devices.capture import CapturedFrames, capture_with_texture
+from slviewer.devices.protocols import Rig
 from slviewer.errors import InputError, SlviewerError
+from slviewer.fringe.presets import short
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.capture import check_space, depth_axis, save_frames
+from slviewer.pipeline.feedback import Progress, part
+from slviewer.pipeline.import_captures import Role, describe_import, import_captures
+from slviewer.pipeline.operation import Job
 from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
-from slviewer.wizard.capture_requests import CaptureRequests
-from slviewer.wizard.engine import Timing, request
-from slviewer.wizard.measure_requests import MeasureRequests
-from slviewer.wizard.snapshot import Level, Notice, PreviewView, Snapshot
-from slviewer.wizard.surfaces import Surfaces
+from slviewer.pipeline.turn import (
+    FULL_TURN_DEG,
+    STEPS,
+    capture_turn,
+    missing_steps,
+    next_turn,
+    place_object,
+    plan_turn,
+    recorded_steps,
+    require_turntable,
+)
+from slviewer.session import atomic
+from slviewer.session.capture import TurnStep
+from slviewer.session.importers.archive import unpack, unpacked_size
+from slviewer.session.names import new_name, plain_name
+from slviewer.session.reading import expand_user
+from slviewer.wizard.engine import request
+from slviewer.wizard.live_scan import LiveCloud, LiveScan
+from slviewer.wizard.result_requests import ResultRequests
+from slviewer.wizard.rig_requests import RigRequests
+from slviewer.wizard.service import Service, Timing
+from slviewer.wizard.snapshot import PreviewView, Snapshot
+
+Purpose = Literal["scan", "plane", "sphere"]
+IMPORTING = "Importing"
+UNPACKED = "import"
+"""Name in the session's folder beside which an upload is unpacked: the session clears what a crash
+leaves of it."""
 
 
-class AutopilotLike(Protocol):
-    """Sends requests by itself, on a thread of its own: the autopilot."""
-
-    @property
-    def running(self) -> bool:
-        """Whether it is sending requests."""
-
-    def start(self) -> None:
-        """Start sending requests."""
-
-    def stop(self) -> None:
-        """Stop sending requests."""
-
-
-class Operator(CaptureRequests, MeasureRequests):
+class Operator(RigRequests, ResultRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(
@@ -46,8 +67,7 @@ class Operator(CaptureRequests, MeasureRequests):
     ) -> None:
         """Open or create `session`, with `rig`, by default the one that the session remembers."""
         super().__init__(set_up, self.capture_pose, timing or Timing())
-        self._autopilot: AutopilotLike | None = None
-        self._surfaces = Surfaces()
+        self._autopilot: Service | None = None
         if session is not None:
             self.open_session(session, rig)
         elif rig is not None:
@@ -80,25 +100,11 @@ class Operator(CaptureRequests, MeasureRequests):
         Returns a function that unsubscribes. A callback must return soon, and must not wait for
         another snapshot.
         """
-        removals = [self._publisher.listeners.add(callback)]
+        unsubscribe = ExitStack()
+        unsubscribe.callback(self._publisher.listeners.add(callback))
         if preview:
-            removals.append(self._preview_listeners.add(preview))
-
-        def stop() -> None:
-            """Remove the callbacks."""
-            for remove in removals:
-                remove()
-
-        return stop
-
-    def notices(self) -> tuple[Notice, ...]:
-        """Return the latest notices, oldest first, also those that no snapshot shows yet."""
-        return self._notices.all()
-
-    def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
-        """Wait for the first snapshot for which `condition` holds, and return it; None after
-        `timeout_s`."""
-        return self._publisher.wait_for(condition, timeout_s)
+            unsubscribe.callback(self._preview_listeners.add(preview))
+        return unsubscribe.close
 
     def wait_until_idle(self, timeout_s: float = 60.0) -> Snapshot:
         """Wait until all captures, jobs and the plan of the next pose are complete; returns the
@@ -110,7 +116,9 @@ class Operator(CaptureRequests, MeasureRequests):
         while True:
             # captures first: each submits its jobs before it ends
             idle = self.wait_for(
-                lambda now: self._acquisition.idle and self._jobs.idle and not _is_planning(now),
+                lambda now: (
+                    self._acquisition.idle and self._jobs.idle and not now.content.pending_plan
+                ),
                 end - time.monotonic(),
             )
             if idle is None:
@@ -118,7 +126,7 @@ class Operator(CaptureRequests, MeasureRequests):
                     f"work is still running after {timeout_s:g} s: cancel it, or wait longer"
                 )
             now = self._publisher.refresh()
-            if not _is_planning(now) and self._publisher.is_current:
+            if not now.content.pending_plan and self._publisher.is_current:
                 return now
 
     @request("Cancelling")
@@ -132,7 +140,7 @@ class Operator(CaptureRequests, MeasureRequests):
             self._jobs.cancel()
 
     @request("Starting autopilot")
-    def start_autopilot(self, autopilot: AutopilotLike) -> None:
+    def start_autopilot(self, autopilot: Service) -> None:
         """Start an autopilot, which sends requests until it is done or `cancel` stops it."""
         with self._lock:
             if self._autopilot and self._autopilot.running:
@@ -140,26 +148,286 @@ class Operator(CaptureRequests, MeasureRequests):
             self._autopilot = autopilot
             autopilot.start()
 
-    def set_autopilot_status(self, act: str) -> None:
-        """Set the autopilot's current act, which the snapshot shows; empty when it has ended."""
-        self._show(autopilot=act)
-
-    def set_preparing(self, share: float | None) -> None:
-        """Set the share of the kernels that are compiled in the background; None: none are being
-        compiled."""
-        self._show(preparing=share)
-
-    def notify(self, level: Level, text: str) -> None:
-        """Add a notice of the caller's own."""
-        self._notices.add(level, text)
-
     def close(self) -> None:
         """Stop everything and close the session; captures are saved already."""
         if self._autopilot:
             self._autopilot.stop()
         super().close()
 
+    # captures
 
-def _is_planning(snapshot: Snapshot) -> bool:
-    """Whether the plan of the next pose is still being computed."""
-    return snapshot.session is not None and snapshot.session.pending_plan is not None
+    @request("Capturing the pose")
+    def capture_pose(self) -> None:
+        """Capture the board where it is; its features are evaluated in the background."""
+        self._capture_pose()
+
+    @request("Retaking the pose")
+    def retake_pose(self, name: str) -> None:
+        """Capture the board in place of a pose; the old one goes to the trash once the new one is
+        saved."""
+        if self._store.load_capture(name).role != "calibration":
+            raise InputError(f"{name} is not a target pose: capture another scan instead")
+        self._capture_pose(name)
+
+    @request("Capturing the scan")
+    def capture_scan(self, label: str = "") -> None:
+        """Capture an object and reconstruct it; `label` is the operator's name for it, any text."""
+        self._capture_scan("scan", label)
+
+    @request("Capturing the plane")
+    def capture_plane(self, label: str = "") -> None:
+        """Capture a flat plate and compare the models on it."""
+        self._capture_scan("plane", label)
+
+    @request("Capturing the sphere")
+    def capture_sphere(self, label: str = "") -> None:
+        """Capture a sphere and compare the models on it."""
+        self._capture_scan("sphere", label)
+
+    @request("Switching hands-free capture")
+    def set_hands_free(self, on: bool) -> None:
+        """Capture a pose whenever the board is held still in a new place."""
+        self._hands_free.is_on = on
+
+    def _capture_pose(self, retaken: str = "") -> None:
+        """Queue the capture of a target pose, in place of the one that is retaken."""
+        # first: a capture that fails is not repeated with every preview
+        self._hands_free.note_capture()
+        store, target = self._store, self._reader.target()
+        name = retaken or self._next_name("pose")
+        if not target:
+            raise InputError("choose the target first: a pose is judged by it")
+
+        def save(captured: CapturedFrames) -> None:
+            """Save the captured frames as a target pose; a retaken pose is included again."""
+            save_frames(store, name, "pose", captured, board=target, force=bool(retaken))
+            if retaken:
+                store.include(name)
+            self._queue_processing()
+
+        self._queue_capture(name, self._pose_sequence(), save)
+
+    def _capture_scan(self, purpose: Purpose, label: str) -> None:
+        """Queue the capture of a scan, plane or sphere."""
+        name = self._next_name(purpose)
+        self._queue_capture(
+            name,
+            self._scan_sequence(),
+            lambda captured: self._save_scan(name, purpose, captured, label),
+        )
+
+    def _save_scan(
+        self,
+        name: str,
+        purpose: Purpose,
+        captured: CapturedFrames,
+        label: str = "",
+        turn_step: TurnStep | None = None,
+    ) -> None:
+        """Save captured frames with the operator's label; reconstruct a scan, and align it where
+        that is wanted, or compare the models on a plane or a sphere."""
+        save_frames(self._store, name, purpose, captured, turn_step=turn_step)
+        if label.strip():
+            self._set_label(name, label)
+        self._queue_processing()
+        if purpose != "scan":
+            self.verify([name], purpose)
+            return
+        self.reconstruct(name)
+        if self._store.decision("align_scans"):
+            self.align(name)
+
+    def _queue_capture(
+        self, name: str, sequence: PatternSequence, save: Callable[[CapturedFrames], object]
+    ) -> None:
+        """Queue a capture. Raises SessionError where the disk is too full."""
+        reel, exposures = self._require_bench().reel, self._reader.exposures_ms()
+        self._check_space(name, len(sequence.frames) * max(1, len(exposures)))
+
+        def finish(captured: CapturedFrames) -> None:
+            """Save the capture, and advance a replayed recording."""
+            save(captured)
+            self._note_change()
+            if reel:
+                # the next recording may lack these
+                if self._acquisition.view().light in ("dark", "pattern"):
+                    self._acquisition.set_light("white")
+                reel.advance()
+
+        self._acquisition.capture(name, sequence, finish, exposures)
+
+    def _check_space(self, name: str, frames: int) -> None:
+        """Raise SessionError where the disk has no room for so many frames."""
+        check_space(self._store, self._require_bench().rig.camera, frames, name)
+
+    def _next_name(self, kind: str) -> str:
+        """Return the next unused name, such as pose_07, counting saved and queued captures."""
+        used = [*self._store.taken_names(), *self._acquisition.names()]
+        numbers = [name.removeprefix(f"{kind}_") for name in used]
+        number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
+        return f"{kind}_{number:02d}"
+
+    # live
+
+    @request("Scanning live")
+    def start_live(self) -> None:
+        """Start a live scan, which ends at `stop_live`, a capture, another rig or session, or a
+        fault."""
+        calibration = self._require_calibration("a live scan needs a calibration")
+        bench = self._require_bench()
+        if bench.reel:
+            raise InputError(
+                "a recording holds only its own patterns: choose a real rig or the simulated one"
+            )
+        axis = depth_axis(calibration.stereo.rig)
+        sequence = replace(short(bench.rig.projector.size, axis), levels=self._reader.levels())
+        live = LiveScan(
+            self._store, axis, sequence, self._acquisition, self._notices,
+            self._live_listeners.call, self._publisher.mark_changed,
+        )  # fmt: skip
+        live.start()
+        self._live = live
+
+    @request("Ending the live scan")
+    def stop_live(self) -> None:
+        """End the live scan, if one runs."""
+        self._acquisition.stop_stream()
+
+    @request("Saving the live scan")
+    def save_live(self, label: str = "") -> None:
+        """Save the frames of the latest live cloud as a scan, and reconstruct it; the live scan
+        goes on."""
+        live = self._live
+        shot = live.stream.copy_latest() if live and live.is_running else None
+        if live is None or shot is None:
+            raise InputError("no live scan runs: start one, and wait for a cloud")
+        name = self._next_name("scan")
+        self._check_space(name, len(shot.frames))
+        source = self._acquisition.view().name
+        captured = CapturedFrames(shot.frames, shot.settings, live.stream.sequence, source)
+        self._save_scan(name, "scan", captured, label)
+
+    @property
+    def live_captures(self) -> int:
+        """The number of short captures of the latest live scan, including those without a cloud."""
+        return 0 if self._live is None else self._live.stream.captured
+
+    def count_live_shown(self, cloud: LiveCloud) -> None:
+        """Record that a cloud was sent to the browsers, which ends its latency."""
+        if self._live:
+            self._live.count_shown(cloud)
+
+    # all round
+
+    @request("Scanning all round")
+    def scan_all_round(
+        self, steps: int = STEPS, range_deg: float = FULL_TURN_DEG, *, then_merge: bool = True
+    ) -> None:
+        """Capture and reconstruct the steps of a turn; `then_merge` merges them and makes a
+        watertight mesh."""
+        self._scan_turn(plan_turn(next_turn(self._store), steps, range_deg), then_merge)
+
+    @request("Resuming the turn")
+    def resume_turn(self, *, then_merge: bool = True) -> None:
+        """Capture the missing steps of the last turn."""
+        self._scan_turn(missing_steps(self._store), then_merge)
+
+    def _scan_turn(self, steps: Sequence[TurnStep], then_merge: bool) -> None:
+        """Queue the capture of steps of one turn, each reconstructed while the table turns on."""
+        store, sequence, turn = self._store, self._scan_sequence(), steps[0].turn
+        bench = self._require_bench()
+        require_turntable(bench.rig)
+        exposures, recorded = self._reader.exposures_ms(), recorded_steps(store, turn)
+        frames = len(sequence.frames) * max(1, len(exposures))
+        self._check_space(turn, frames * len(steps))
+        place_object(bench)
+
+        def work(rig: Rig, progress: Progress) -> None:
+            """Capture all steps."""
+
+            def capture_step(step: TurnStep, progress: Progress) -> None:
+                """Capture and save one step, and queue its reconstruction."""
+                captured = capture_with_texture(
+                    rig,
+                    sequence,
+                    exposures,
+                    progress=lambda done, n: progress(done / n, f"frame {done} of {n}"),
+                )
+                self._save_scan(step.name, "scan", captured, turn_step=step)
+
+            capture_turn(rig, steps, capture_step, recorded, progress, self._warner("scans"))
+
+        def done(_: None) -> None:
+            """Report the captured turn, and queue its merge."""
+            names = [step.name for step in recorded_steps(store, turn)]
+            self._notices.add("good", f"{turn}: {len(names)} scans all round")
+            if then_merge:
+                self._merge_turn(names)
+
+        self._acquisition.run_task("Scanning all round", work, done)
+
+    # files
+
+    @request(IMPORTING)
+    def import_folder(
+        self, folder: Path | str, layout: str = "detect", role: Role = "calibration", **options: Any
+    ) -> None:
+        """Import the captures in a folder of this computer; `options` as `import_captures` takes
+        them."""
+        path = str(folder).strip()
+        if not path:
+            raise InputError(
+                "no folder is named: enter the path of a folder on the computer that runs slviewer"
+            )
+        self._work(
+            IMPORTING,
+            lambda job: self._import(job, expand_user(path), layout, role, options),
+            "frames",
+        )
+
+    @request(IMPORTING)
+    def import_zip(
+        self,
+        name: str,
+        content: bytes,
+        layout: str = "detect",
+        role: Role = "calibration",
+        **options: Any,
+    ) -> None:
+        """Import the captures in a zip that was uploaded as `name`; images outside of folders
+        become one capture of that name."""
+
+        def work(job: Job) -> str:
+            """Unpack the zip into a temporary folder and import it."""
+            archive, words = io.BytesIO(content), f"unpacking {name}"
+            job.progress(0.0, words)
+            place, size = job.store.folder / UNPACKED, unpacked_size(archive)
+            with atomic.staged_folder(place, size) as staged:
+                folder = staged / new_name(
+                    plain_name(Path(name).stem, "capture").strip("._-") or "capture"
+                )
+                folder.mkdir()
+                try:
+                    unpacking, importing = part(job.progress, 0, 0.2), part(job.progress, 0.2, 1)
+                    source, warnings = unpack(archive, folder, lambda done: unpacking(done, words))
+                    for warning in warnings:
+                        job.warn(warning)
+                    origin = {"origin": name, **options}
+                    return self._import(
+                        replace(job, progress=importing), source, layout, role, origin
+                    )
+                finally:
+                    atomic.discard(staged)
+
+        self._work(IMPORTING, work, "frames")
+
+    def _import(
+        self, job: Job, source: Path, layout: str, role: Role, options: dict[str, Any]
+    ) -> str:
+        """Import the captures in a folder, and queue their processing; returns a sentence about
+        them."""
+        names = import_captures(
+            source, job.store, layout, role=role, progress=job.progress, warn=job.warn, **options
+        )
+        self._queue_processing()
+        return describe_import(names, role=role)

@@ -1,10 +1,11 @@
-"""Where the target has been and should be held next, from the poses of a session.
+"""Where the target has been and should be held next, from the poses of a session, computed on a
+thread of its own, as that takes about a second.
 
 The first poses are spread by what they cover; from the third on, the rig is known well enough for
 its information matrix to say which pose adds most.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -34,6 +35,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.target.board import Board
+from slviewer.wizard.service import LatestWorker, log
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +105,8 @@ class PlanInput:
 USUAL_SIGMA = 4e-5
 """Default of the wanted sigma, as a share of the middle depth: below a single point's noise, so
 that more poses would hardly improve a scan."""
+MOST_PLANS = 8
+"""Plans cached, so that excluding a pose and including it again does not compute one twice."""
 MIN_POSES = 8
 """Fewer are never enough: errors show only where poses can be compared."""
 
@@ -212,3 +216,75 @@ def _plan_by_coverage(
     except InputError:  # nothing fits into the view
         return by_coverage
     return replace(by_coverage, suggestion=suggestion)
+
+
+class Planner(LatestWorker[PlanInput]):
+    """Provides the best plan available; `changed()` is called, on the planner's thread, when a
+    better one is ready.
+
+    Only the latest request is computed, from so many ``trials``.
+    """
+
+    def __init__(self, changed: Callable[[], None], trials: int = TRIALS) -> None:
+        self._changed, self._trials = changed, trials
+        self._plans: dict[object, tuple[PosePlan, bool]] = {}  # and whether it is final
+        # the last one that was computed and looked up
+        self._latest: tuple[PlanInput, PosePlan] | None = None
+        self._requested: object = None
+        super().__init__("slviewer planner", self._compute_plan)
+
+    def look_up(self, given: PlanInput) -> tuple[PosePlan, bool]:
+        """Return (the best plan available, whether it is final). One that is not final is improved
+        by `request`.
+
+        Until then its poses are those of the last final plan for the same board and devices, and
+        its suggestion and sigma are that plan's as long as poses were only added.
+        """
+        with self._condition:
+            if cached := self._plans.get(given.key):
+                if cached[1] and given.takes_time:
+                    self._latest = given, cached[0]
+                return cached
+            latest = self._latest
+        if not given.takes_time:
+            return self._cache_plan(given, plan_next_pose(given, self._trials), True)
+        if latest is None or latest[0].rig_key != given.rig_key:
+            return self._cache_plan(given, quick_plan(given, None), False)
+        earlier, plan = latest
+        same = {name for name, _ in {*earlier.hashes} & {*given.hashes}}
+        poses = {name: T for name, T in plan.poses.items() if name in same}
+        interim = quick_plan(given, replace(plan, poses=poses))
+        if earlier.features.keys() <= same:
+            suggestion = plan.suggestion or interim.suggestion
+            interim = replace(interim, sigma_mm=plan.sigma_mm, suggestion=suggestion)
+        return self._cache_plan(given, interim, False)
+
+    def request(self, given: PlanInput) -> None:
+        """Compute the plan for this input in the background, in place of an earlier request."""
+        with self._condition:
+            if self._requested == given.key or self._plans.get(given.key, (None, False))[1]:
+                return
+            self._requested = given.key
+        self.offer(given)
+
+    def _compute_plan(self, given: PlanInput) -> None:
+        """Compute the requested plan on the planner's thread and store it; an interim plan where
+        computing fails."""
+        if given.key != self._requested:
+            return
+        try:
+            computed = plan_next_pose(given, self._trials)
+        except Exception:  # the operator can go on without a suggestion
+            log.exception("the next pose could not be computed")
+            computed, _ = self.look_up(given)
+        self._cache_plan(given, computed, True)
+        self._changed()
+
+    def _cache_plan(self, given: PlanInput, plan: PosePlan, final: bool) -> tuple[PosePlan, bool]:
+        """Cache a plan under its input's key, dropping the oldest where the cache is full; returns
+        what `look_up` does."""
+        with self._condition:
+            while len(self._plans) >= MOST_PLANS:
+                self._plans.pop(next(iter(self._plans)))
+            self._plans[given.key] = plan, final
+        return plan, final

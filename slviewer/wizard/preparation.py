@@ -19,8 +19,8 @@ from llvmlite import binding
 
 from slviewer.geometry.jit_cache import cache_root, hash_sources
 from slviewer.wizard.autopilot import RIG, Autopilot
-from slviewer.wizard.notices import log
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.service import Service, log
 
 SCALE = 0.2
 """Of the rig's resolution: small, and every step still succeeds."""
@@ -30,7 +30,7 @@ COMMAND = [sys.executable, "-m", "slviewer.wizard.preparation"]
 _ACTS = 32  # of an autopilot with eight poses
 
 
-class Preparation:
+class Preparation(Service):
     """The process that compiles.
 
     ``report`` is called, on a thread of its own, with the share of its work that is done, and with
@@ -40,20 +40,16 @@ class Preparation:
     def __init__(
         self, report: Callable[[float | None], None], command: Sequence[str] = COMMAND
     ) -> None:
+        super().__init__("slviewer preparation")
         self._report, self._command = report, command
         self._process: subprocess.Popen[str] | None = None
-        self._thread = threading.Thread(target=self._run, name="slviewer preparation", daemon=True)
-
-    def start(self) -> None:
-        """Start the process, unless everything is compiled."""
-        self._thread.start()
 
     def close(self) -> None:
         """End the process; what it has compiled is saved."""
         if self._process:
             self._process.kill()
 
-    def _run(self) -> None:
+    def _serve(self) -> None:
         """Start the process, follow its progress, and note when it has ended well."""
         done = prepared_file()
         if done is None or done.exists() or os.environ.get(SWITCHED_OFF):

@@ -5,11 +5,9 @@ is none. Frames that arrive while a thread is busy replace one another, so that 
 the one analysed next.
 """
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -21,11 +19,8 @@ from slviewer.geometry.lens import Lens
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
 from slviewer.target.planar import fit_homography, to_image
-from slviewer.wizard.notices import log
-from slviewer.wizard.service import Service
+from slviewer.wizard.service import LatestWorker, Timing
 from slviewer.wizard.snapshot import BoardSeen, PreviewView
-
-Item = TypeVar("Item")
 
 SEARCH_PX = 800
 """Longest side of the image in which the board is detected, and which panels show."""
@@ -37,8 +32,6 @@ still."""
 # of a px
 _UNCHANGED = 6.0
 _THUMBNAIL_PX = 160
-HOLD_S = 1.0  # for which a board is held still before a hands-free countdown starts
-COUNT_S = 1.0  # of the countdown
 _REST = 2.0  # pause after a detection, as a multiple of its duration: a third of one core at most
 
 
@@ -48,42 +41,6 @@ class Watch:
 
     board: Board | None = None
     lens: Lens | None = None
-
-
-class LatestWorker(Service, Generic[Item]):
-    """A thread that calls `work(item)` with the latest item offered, and drops earlier ones."""
-
-    def __init__(self, name: str, work: Callable[[Item], None], rest: float = 0.0) -> None:
-        super().__init__(name)
-        self._work, self._rest = work, rest
-        self._item: Item | None = None
-        self._thread.start()
-
-    def offer(self, item: Item) -> None:
-        """Set the next item, in place of one that is still waiting."""
-        with self._condition:
-            self._item = item
-            self._condition.notify_all()
-
-    def _serve(self) -> None:
-        """Process the latest item until closing, pausing `rest` times its duration; failures are
-        logged."""
-        while True:
-            with self._condition:
-                self._condition.wait_for(lambda: self._closing or self._item is not None)
-                if self._closing:
-                    return
-                item, self._item = self._item, None
-            assert item is not None
-            begun = time.monotonic()
-            try:
-                self._work(item)
-            except Exception:  # one bad item must not end the thread
-                log.exception("%s failed", threading.current_thread().name)
-            with self._condition:
-                self._condition.wait_for(
-                    lambda: self._closing, self._rest * (time.monotonic() - begun)
-                )
 
 
 class Watcher:
@@ -157,7 +114,12 @@ class Watcher:
             still = self._stillness.update(
                 detection.pixels, STILL_PX * image.shape[1] / scale, time_s
             )
-            board = observe_board(watch.board, detection, still, watch.lens, time_s)
+            points, pixels = watch.board.points[detection.ids], detection.pixels
+            if len(points) >= 4:
+                H = fit_homography(points[:, :2], pixels)
+                outline = to_image(H, watch.board.outline()[:, :2])
+                T = approximate_pose(points, pixels, watch.lens) if watch.lens else None
+                board = BoardSeen(pixels, outline, still, T, time_s)
         else:
             self._stillness.reset()
         self._result = (watch, board, missing)
@@ -206,12 +168,9 @@ def brightness(frame: np.ndarray, full_scale: int | None = None) -> tuple[float,
     of shares)."""
     top = clip_level(frame.dtype, int(frame.max(initial=0)), full_scale)
     some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
-    by_level = np.bincount(some.ravel(), minlength=int(top) + 1)
-    brightest = int(np.searchsorted(by_level.cumsum(), 0.995 * some.size))
-    shares = np.histogram(
-        np.arange(len(by_level)), BINS, (0, top + 1), weights=by_level / some.size
-    )[0]
-    return float(by_level[int(top) :].sum()) / some.size, brightest / top, shares
+    brightest = float(np.percentile(some, 99.5, method="inverted_cdf"))
+    shares = np.histogram(some, BINS, (0, top + 1))[0] / some.size
+    return float(np.mean(some >= int(top))), brightest / top, shares
 
 
 def detect_in_preview(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:
@@ -225,25 +184,12 @@ def detect_in_preview(board: Board | None, image: np.ndarray) -> tuple[Detection
         return None, str(error)
 
 
-def observe_board(
-    board: Board, detection: Detection, still_s: float, lens: Lens | None, time_s: float
-) -> BoardSeen | None:
-    """Return the detected board for display: outline (4, 2) px, approximate pose; None with fewer
-    than 4 features."""
-    points = board.points[detection.ids]
-    if len(points) < 4:
-        return None
-    H = fit_homography(points[:, :2], detection.pixels)
-    T = None if lens is None else approximate_pose(points, detection.pixels, lens)
-    return BoardSeen(detection.pixels, to_image(H, board.outline()[:, :2]), still_s, T, time_s)
-
-
 class HandsFree:
-    """Decides when to capture hands-free: ``count_s`` after the board was held still for ``hold_s``
-    in a new place."""
+    """Decides when to capture hands-free: a countdown after the board was held still in a new
+    place."""
 
-    def __init__(self, hold_s: float = HOLD_S, count_s: float = COUNT_S) -> None:
-        self._hold_s, self._count_s = hold_s, count_s
+    def __init__(self, timing: Timing) -> None:
+        self._timing = timing
         self.is_on = False
         self._captured: np.ndarray | None = None  # the board's outline at the last capture
         self._requested: float | None = (
@@ -257,27 +203,19 @@ class HandsFree:
         if self._requested is not None and not busy and board and board.time_s > self._requested:
             self._captured, self._requested = board.outline, None
         held = self.is_on and self._requested is None and board is not None and not busy
-        if (
-            not held
-            or board is None
-            or board.still_s < self._hold_s
-            or self._is_captured(board.outline)
-        ):
+        if not held or board is None or board.still_s < self._timing.hold_s:
             self._begun = None
             return None
+        if self._captured is not None:
+            size = np.linalg.norm(np.ptp(board.outline, axis=0))
+            if np.abs(board.outline - self._captured).max() < 0.03 * size:  # the same place
+                self._begun = None
+                return None
         if self._begun is None:
             self._begun = now
-        return self._count_s - (now - self._begun)
+        return self._timing.count_s - (now - self._begun)
 
     def note_capture(self) -> None:
         """Note that a capture was requested; the board's outline in the next preview is then the
         captured place."""
         self._requested, self._begun = time.monotonic(), None
-
-    def _is_captured(self, outline: np.ndarray) -> bool:
-        """Whether the outline (4, 2) px is within 3 % of the board's size of the last captured
-        one."""
-        if self._captured is None:
-            return False
-        size = np.linalg.norm(np.ptp(outline, axis=0))
-        return bool(np.abs(outline - self._captured).max() < 0.03 * size)

@@ -2,23 +2,17 @@
 together."""
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Generic, TypeVar
+from typing import Generic
 
-from slviewer.wizard.notices import describe_failure, log
-from slviewer.wizard.service import Service
+from slviewer.wizard.notices import describe_failure
+from slviewer.wizard.service import Item, Service, log
 from slviewer.wizard.snapshot import Snapshot
 
 PAUSE_S = 0.05
 """Between two snapshots: a panel needs no more than twenty a second."""
 REFRESH_S = 30.0
-RETRY_S = 2.0
-"""After a snapshot that is not the current state, until the next is built although nothing is known
-to have changed."""
-
-Item = TypeVar("Item")
 
 
 class Listeners(Generic[Item]):
@@ -59,7 +53,7 @@ class Publisher(Service):
     """
 
     def __init__(
-        self, build: Callable[[int, bool], Snapshot], first: Snapshot, retry_s: float = RETRY_S
+        self, build: Callable[[int, bool], Snapshot], first: Snapshot, retry_s: float
     ) -> None:
         super().__init__("slviewer publisher")
         self._build, self._retry_s = build, retry_s
@@ -67,10 +61,6 @@ class Publisher(Service):
         self._session_changed = self._urgent = False
         self.latest = first
         self.listeners = Listeners[Snapshot]()
-
-    def start(self) -> None:
-        """Start the publisher's thread, once everything exists that `build` reads."""
-        self._thread.start()
 
     def mark_changed(self, session: bool = False) -> None:
         """Request a snapshot; `session`: the session's files have changed too."""
@@ -98,14 +88,9 @@ class Publisher(Service):
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
         """Wait for the first snapshot for which `condition` holds, and return it; None after
         `timeout_s`."""
-        end = time.monotonic() + timeout_s
         with self._condition:
-            while not condition(self.latest):
-                remaining_s = end - time.monotonic()
-                if remaining_s <= 0 or self._closing:
-                    return None
-                self._condition.wait(remaining_s)
-            return self.latest
+            self._condition.wait_for(lambda: condition(self.latest) or self._closing, timeout_s)
+            return self.latest if condition(self.latest) else None
 
     def _serve(self) -> None:
         """Build and publish a snapshot after each batch of changes, or after a failure, until
@@ -118,10 +103,8 @@ class Publisher(Service):
                 )
                 if self._closing:
                     return
-                requested, session = (
-                    self._requested,
-                    self._session_changed or bool(self.latest.read_failure),
-                )
+                requested = self._requested
+                session = self._session_changed or bool(self.latest.read_failure)
                 self._session_changed = self._urgent = False
             version = self.latest.version + 1
             try:

@@ -1,17 +1,40 @@
-"""Requests to calibrate, verify, reconstruct, merge, edit and export, and to choose what results
-are made from."""
+"""Requests to calibrate, verify, reconstruct, merge, edit, measure and export, and to choose what
+results are made from."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slviewer.errors import Cancelled, InputError, SlviewerError
+from slviewer.evaluation.render import format_count
+from slviewer.inspection.regions import Region
 from slviewer.pipeline.accept import ValidateSettings, validate
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
+from slviewer.pipeline.compare import CompareSettings, compare
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, step_history
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
-from slviewer.pipeline.feedback import Progress, Warn, part
-from slviewer.pipeline.measure import MERGED
+from slviewer.pipeline.feedback import part
+from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
+from slviewer.pipeline.measure import (
+    MERGED,
+    MeasuredSurface,
+    MeasureSettings,
+    Place,
+    RelateSettings,
+    export_measurements,
+    measure,
+    relate,
+    rename_measurement,
+    restore_measurement,
+    trash_measurement,
+)
+from slviewer.pipeline.measure import (
+    What as Tool,
+)
 from slviewer.pipeline.merge import (
     PLACEMENTS,
     AlignSettings,
@@ -30,27 +53,30 @@ from slviewer.pipeline.models import (
     available_models,
     check_accepted,
 )
-from slviewer.pipeline.operation import Findings
+from slviewer.pipeline.operation import Job
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
-from slviewer.records.merge import Merge
+from slviewer.records.measurement import MeasuredRegion
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused
-from slviewer.session.names import clean_label
+from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
+from slviewer.session.names import clean_label, plain_name, safe_name
+from slviewer.session.nominal import NOMINALS, Units, read_nominal
 from slviewer.session.scan_edits import load_edits, load_region, save_region
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import select_support
 from slviewer.wizard.diagnostics import write_bundle
-from slviewer.wizard.engine import Engine, request
-from slviewer.wizard.jobs import Reporter
+from slviewer.wizard.engine import Engine, on_session, request
 from slviewer.wizard.notices import describe_failure
-from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
+from slviewer.wizard.result_views import load_scan_cloud, surface_to_measure, whole_cloud
 from slviewer.wizard.session_reader import missing_for_splined
 
-MERGING = "Merging"
+TABLE, PLAN = "measurements.csv", Path(OWN_PLAN).name
+MERGING, MEASURING, COMPARING = "Merging", "Measuring", "Comparing with the nominal model"
 _ALTERNATIVES = {
     "features": "use the initial alignment by picked points",
     "picked": "pick other points",
@@ -59,17 +85,11 @@ _ALTERNATIVES = {
 
 
 class ResultRequests(Engine):
-    """Requests that compute results from captures, and decisions about poses, scans and models."""
+    """Requests that compute results from captures, decisions about poses, scans and models, and
+    measurements on a scan or a merge."""
 
-    @request("Excluding the pose")
-    def exclude(self, name: str, why: str = "by hand") -> None:
-        """Exclude a pose from calibrations."""
-        self._store.exclude(name, why)
-
-    @request("Including the pose")
-    def include(self, name: str) -> None:
-        """Include an excluded pose again."""
-        self._store.include(name)
+    exclude = on_session("Excluding the pose", Session.exclude)
+    include = on_session("Including the pose", Session.include)
 
     @request("Deleting")
     def delete(self, name: str) -> None:
@@ -78,7 +98,7 @@ class ResultRequests(Engine):
         store.trash_capture(name)
         store.include(name)
         for kind in ("poses", "clouds", "verify", "trust", PLACEMENTS):
-            if store.state_of(f"{kind}/{name}") != "absent":
+            if store.has_result(f"{kind}/{name}"):
                 store.trash_result(f"{kind}/{name}")
 
     @request("Restoring")
@@ -129,10 +149,9 @@ class ResultRequests(Engine):
             )
         self._store.decide("model", name or None)
 
-    @request("Using the rejected calibration")
-    def accept_rejected_calibration(self, on: bool) -> None:
-        """Allow or forbid using the current calibration although it was rejected."""
-        accept_rejected_calibration(self._store, on)
+    accept_rejected_calibration = on_session(
+        "Using the rejected calibration", accept_rejected_calibration
+    )
 
     @request("Verifying")
     def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
@@ -169,10 +188,7 @@ class ResultRequests(Engine):
         """Return names of captures. Raises InputError for one that does not exist."""
         return [self._store.load_capture(name).name for name in names]
 
-    @request("Undoing the alignment")
-    def undo_alignment(self, name: str) -> None:
-        """Take a scan away from the aligned ones."""
-        remove_placement(self._store, name)
+    undo_alignment = on_session("Undoing the alignment", remove_placement)
 
     @request("Switching the alignment of scans")
     def set_align_scans(self, on: bool) -> None:
@@ -181,12 +197,6 @@ class ResultRequests(Engine):
         self._store.decide("align_scans", on or None)
         if on:
             self.align()
-
-    def _finish_scan(self, name: str) -> None:
-        """Reconstruct a scan that was just captured, and align it where that is wanted."""
-        self.reconstruct(name)
-        if self._store.decision("align_scans"):
-            self.align(name)
 
     # merges
 
@@ -217,43 +227,37 @@ class ResultRequests(Engine):
     def _merge_turn(self, names: list[str]) -> None:
         """Queue the merge of the scans of a turn by the angles of its turntable, and a watertight
         mesh of it in the exports; where that does not close, the merge stays."""
-        store, warn = self._store, self._warner("merge")
 
-        def work(report: Reporter) -> tuple[Findings[Merge], str]:
-            """Merge and mesh; returns the merge, and a sentence about the mesh."""
-            settings = MergeSettings(names, names[0], accept_rejected=accepts_rejected(store))
-            guarded = store.guarded(report.saving)
-            merged = merge_turn(guarded, settings, part(report, 0, 0.7), warn)
-            (number,) = merged
+        def work(job: Job) -> str:
+            """Merge and mesh; returns a sentence about both."""
+            settings = MergeSettings(names, names[0], accept_rejected=accepts_rejected(job.store))
+            merging, meshing = part(job.progress, 0, 0.7), part(job.progress, 0.7, 1)
+            found = merge_turn(job.store, settings, merging, job.warn)
+            ((number, merged),) = found.items()
             try:
                 words = _export_file(
-                    guarded, "merged-mesh", number, "ply", WATERTIGHT, part(report, 0.7, 1), warn
+                    replace(job, progress=meshing), "merged-mesh", number, "ply", WATERTIGHT
                 )
             except Cancelled:
                 raise
             except SlviewerError as error:
                 words = "no watertight mesh was made"
-                warn(f"{words}: {error}")
-            report(1.0, "merged")
-            return merged, words
-
-        def describe(result: tuple[Findings[Merge], str]) -> str:
-            """Describe the merge and the mesh in one sentence."""
-            merged, words = result[0].only, result[1]
+                job.warn(f"{words}: {error}")
+            job.progress(1.0, "merged")
             worst = max(pair.rms_mm for pair in merged.pairs.values())
             return (
                 f"{len(merged.scans)} scans merged on {merged.reference}, RMS up to {worst:.3f} mm;"
                 f" {words}"
             )
 
-        self._submit(MERGING, work, describe, self._begin_merge("turntable"))
+        self._work(MERGING, work, "merge", self._begin_merge("turntable"))
 
     def _begin_merge(self, start: str) -> Callable[[BaseException], None]:
         """Forget why the last merge failed; returns what notes why this one did.
 
         `start` is its initial alignment, to which there are alternatives.
         """
-        self._show(merge_failure="", merge_refusal=None)
+        self.show(merge_failure="", merge_refusal=None)
 
         def failed(error: BaseException) -> None:
             """Store and report why the merge failed, and suggest another initial alignment where
@@ -263,7 +267,7 @@ class ResultRequests(Engine):
             if reason in ("overlap", "disagree"):
                 other = "use the initial alignment by features, or by picked points"
                 text = f"{text} Or {_ALTERNATIVES.get(start, other)}."
-            self._show(merge_failure=text, merge_refusal=reason)
+            self.show(merge_failure=text, merge_refusal=reason)
             self._notices.add("error", text, f"merge-{reason}" if reason else "merge")
 
         return failed
@@ -271,10 +275,10 @@ class ResultRequests(Engine):
     def _last_merge(self, missing: str) -> str:
         """Return the number of the current merge. Raises InputError with ``missing`` without
         one."""
-        session = self._publisher.refresh().session
-        if session is None or session.merge is None:
+        merge = self._publisher.refresh().content.merge
+        if merge is None:
             raise InputError(missing)
-        return session.merge.name
+        return merge.name
 
     @request("Undoing the merge")
     def undo_merge(self) -> None:
@@ -285,10 +289,7 @@ class ResultRequests(Engine):
 
     # which points of scans are used
 
-    @request("Setting the region")
-    def set_region(self, region: RegionOfInterest, on: bool = True) -> None:
-        """Make a box the session's region of interest, in effect or not."""
-        save_region(self._store, region, on)
+    set_region = on_session("Setting the region", save_region)
 
     @request("Switching the region")
     def switch_region(self, on: bool) -> None:
@@ -322,13 +323,12 @@ class ResultRequests(Engine):
         Scans without such a plane, and those that it was deleted from before, stay as they are,
         with a warning; where all of them do, it fails.
         """
-        store, warn = self._store, self._warner("scans")
 
-        def work(report: Reporter) -> str:
+        def work(job: Job) -> str:
             """Delete the supports; returns a sentence about them."""
-            selections, refused = list[Selection](), list[str]()
+            store, selections, refused = job.store, list[Selection](), list[str]()
             for i, name in enumerate(scans):
-                report(i / len(scans), f"removing the support from {name}")
+                job.progress(i / len(scans), f"removing the support from {name}")
                 if any(edit.plane is not None for edit in load_edits(store, name).active):
                     refused.append(
                         f"{name}: its support was removed before; Undo edit brings it back"
@@ -342,14 +342,14 @@ class ResultRequests(Engine):
                     refused.append(f"{name}: {error}")
             if not selections:
                 raise InputError("; ".join(refused) or "no scan is reconstructed yet")
-            deleted = delete_points(store.guarded(report.saving), selections, SUPPORT)
+            deleted = delete_points(store, selections, SUPPORT)
             for reason in refused:
-                warn(reason)
-            report(1.0, "support removed")
+                job.warn(reason)
+            job.progress(1.0, "support removed")
             counts = ", ".join(f"{name} {count:,} points" for name, count in deleted.items())
             return f"support removed: {counts}; Undo edit brings it back"
 
-        self._submit("Removing the support", work, str)
+        self._work("Removing the support", work, "scans")
 
     @request("Undoing the edit")
     def undo_edit(self, *scans: str) -> None:
@@ -378,8 +378,7 @@ class ResultRequests(Engine):
         the current one. `plan`: how to mesh; `texture`: side of its image, px, of a .glb or .obj;
         `white`: its white balance.
         """
-        store, warn = self._store, self._warner("measurements")
-        chosen = file_format or formats(what)[0]
+        store, chosen = self._store, file_format or formats(what)[0]
         check_export(what, chosen)
         if what not in ("report", "table"):
             check_accepted(store, accepts_rejected(store))
@@ -388,58 +387,198 @@ class ResultRequests(Engine):
         if what in ("merge", "merged-mesh"):
             name = self._last_merge("there is no merge yet: merge scans first")
 
-        def write_textured(report: Reporter) -> str:
+        def write_textured(job: Job) -> str:
             """Write a mesh with a texture; returns a sentence that begins with the file's name."""
             source = f"{MERGED}{name}" if what == "merged-mesh" else name
             path = store.exports / default_file_name(what, name, chosen)
             made = mesh(
                 store, [source], path, plan=plan, texture=texture, white=white,
-                accept_rejected=accepts_rejected(store), progress=part(report, 0, 0.98), warn=warn,
+                accept_rejected=accepts_rejected(store), progress=part(job.progress, 0, 0.98),
+                warn=job.warn,
             )  # fmt: skip
             assert made.textured is not None
-            report(1.0, "exported")
+            job.progress(1.0, "exported")
             words = made.meshed.text().splitlines()[0]
             return f"{path.name} is ready to download: {words}; {made.textured.text()}"
 
-        def write(report: Reporter) -> str:
+        def write(job: Job) -> str:
             """Write any other file, as `_export_file` does."""
-            return _export_file(
-                store.guarded(report.saving), what, name, chosen, plan, report, warn
-            )
+            return _export_file(job, what, name, chosen, plan)
 
-        self._submit("Exporting", write if texture is None else write_textured, str)
-
-    def report(self) -> bool:
-        """Write the HTML report into the exports."""
-        return self.export("report")
+        self._work("Exporting", write if texture is None else write_textured, "measurements")
 
     @request("Collecting diagnostics")
     def diagnostic_bundle(self) -> None:
         """Write a zip with versions, settings, logs and small previews, without frames, into the
         exports."""
-        self._submit(
+        snapshot, preview = self._publisher.refresh(), self._preview
+        self._work(
             "Collecting diagnostics",
-            partial(write_bundle, self._store, self._publisher.refresh(), self._preview, self._log),
-            "{} is ready to download".format,
+            lambda job: write_bundle(job, snapshot, preview, self._log),
         )
+
+    # measuring
+
+    def surface(self, name: str) -> MeasuredSurface:
+        """Load a scan or merge to measure on, which is slow. Raises InputError where it cannot be
+        measured on."""
+        return surface_to_measure(self._store, name)
+
+    @request(MEASURING)
+    def measure(
+        self, on: str, what: Tool, at: Sequence[Place] = (), region: Region | None = None
+    ) -> None:
+        """Measure on a surface, at places of it, or in a region."""
+        chosen = (
+            {} if region is None else from_plain(to_plain(region), MeasuredRegion).to_settings()
+        )
+        chosen["at"] = [int(number) for number in np.ravel(at)] if len(at) else ()
+        settings = MeasureSettings(on, what, **chosen, load=partial(surface_to_measure, name=on))
+        self._run(MEASURING, measure, settings, "measurements")
+
+    @request(MEASURING)
+    def measure_between(self, a: str, b: str) -> None:
+        """Measure angles and distances between two points or fits, by their ids."""
+        self._run(MEASURING, relate, RelateSettings(a, b), "measurements")
+
+    @request("Reading the nominal model")
+    def upload_nominal(self, name: str, content: bytes) -> None:
+        """Save an uploaded nominal model in the session, if it can be read."""
+        title = "Reading the nominal model"
+        self._save_upload(title, NOMINALS, name, content, lambda path: read_nominal(path).text())
+
+    @request("Reading the plan")
+    def upload_plan(self, name: str, content: bytes) -> None:
+        """Save an uploaded inspection plan in the session, if it can be read. Its nominal model is
+        the session's one of that file name."""
+
+        def describe(path: Path) -> str:
+            """Read the plan; returns a sentence about it."""
+            plan = read_plan(path)
+            return (
+                f"{plan.name}: {format_count(len(plan.characteristic), 'characteristic')}; run it"
+                " on a scan"
+            )
+
+        if not name.lower().endswith(".toml"):
+            raise InputError(
+                f"{name} is not a plan: choose the .toml file that Make plan or slviewer plan wrote"
+            )
+        self._save_upload("Reading the plan", PLANS, name, content, describe)
+
+    def _save_upload(
+        self, title: str, place: str, name: str, content: bytes, read: Callable[[Path], str]
+    ) -> None:
+        """Save an uploaded file in a folder of the session, if ``read`` can read it, which
+        describes it."""
+        plain = plain_name(Path(name).name, "nominal")
+
+        def work(job: Job) -> str:
+            """Write the upload to its place if it can be read; returns its description."""
+            job.progress(0.0, f"reading {plain}")
+            target = job.store.folder / place / plain
+            with job.store.staged_file(target, len(content)) as path:
+                path.write_bytes(content)
+                description = read(path)
+            job.progress(1.0, "read")
+            return description
+
+        self._work(title, work)
+
+    @request("Running the plan")
+    def run_plan(self, plan: str, *surfaces: str) -> None:
+        """Inspect surfaces, each a part, by a plan of `SessionView.plans`; also writes the report
+        into the exports."""
+        store = self._store
+        if plan not in list_plans(store.folder):
+            raise InputError(f"there is no plan {plan!r} in the session: make or upload one first")
+        if not surfaces:
+            raise InputError("no scan to inspect: reconstruct one in the step Scan first")
+        settings = RunPlanSettings(store.folder / plan, surfaces)
+        self._run("Running the plan", run_plan, settings, "measurements")
+
+    @request(COMPARING)
+    def compare_nominal(
+        self, on: str, nominal: str, units: Units | None = None, tolerance_mm: float | None = None
+    ) -> None:
+        """Measure a surface's deviation from one of the session's nominal models after best fit;
+        also writes a PLY."""
+        path = self._store.folder / NOMINALS / safe_name(nominal)
+        if not path.is_file():
+            raise InputError(
+                f"there is no nominal model {nominal!r} in the session: upload it first"
+            )
+        load = partial(surface_to_measure, name=on)
+        settings = CompareSettings(on, path, tolerance_mm, units, load=load)
+
+        def failed(error: BaseException) -> None:
+            """Report why, in the words of the panel."""
+            self._notices.add_failure(COMPARING, _reword(error))
+
+        self._run(COMPARING, compare, settings, "measurements", failed)
+
+    relabel_measurement = on_session("Renaming", rename_measurement)
+    delete_measurement = on_session("Deleting", trash_measurement)
+    undo_delete = on_session("Restoring", restore_measurement)
+
+    @request("Writing the table")
+    def export_measurements_table(self) -> None:
+        """Write all measurements as CSV into the exports."""
+
+        def write(job: Job, path: Path) -> str:
+            """Write the CSV; returns the number of measurements in words."""
+            return format_count(export_measurements(job.store, path), "measurement")
+
+        self._export_by("Writing the table", TABLE, write)
+
+    @request("Making the plan")
+    def make_inspection_plan(self) -> None:
+        """Write an inspection plan of the fits and relations into the exports, to repeat them on
+        other scans."""
+
+        def write(job: Job, path: Path) -> str:
+            """Write the plan; returns what to do with it."""
+            made = make_plan(job, TOLERANCE_MM, job.store.folder.name)
+            write_plan(made, path)
+            return (
+                f"{format_count(len(made.characteristic), 'characteristic')}; set its limits, then"
+                f" upload it below, or run slviewer inspect-parts {PLAN} SESSION..."
+            )
+
+        self._export_by("Making the plan", PLAN, write)
+
+    def _export_by(self, title: str, name: str, write: Callable[[Job, Path], str]) -> None:
+        """Queue the writing of a file into the exports; ``write`` returns words about it."""
+
+        def work(job: Job) -> str:
+            """Write the file; returns a sentence about it."""
+            with job.store.staged_export(name) as path:
+                words = write(job, path)
+            job.progress(1.0, "written")
+            return f"{name} is ready to download: {words}"
+
+        self._work(title, work, "measurements")
 
 
 def _export_file(
-    session: Session,
-    what: What,
-    name: str,
-    file_format: str,
-    plan: MeshingPlan | None,
-    progress: Progress,
-    warn: Warn,
+    job: Job, what: What, name: str, file_format: str, plan: MeshingPlan | None
 ) -> str:
     """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the
     file's name."""
-    file_name = default_file_name(what, name, file_format)
-    with session.staged_export(file_name) as path:
+    store, file_name = job.store, default_file_name(what, name, file_format)
+    with store.staged_export(file_name) as path:
         exported = export(
-            session, what, name, out=path, plan=plan, accept_rejected=accepts_rejected(session),
-            progress=part(progress, 0, 0.98), warn=warn,
+            store, what, name, out=path, plan=plan, accept_rejected=accepts_rejected(store),
+            progress=part(job.progress, 0, 0.98), warn=job.warn,
         )  # fmt: skip
-    progress(1.0, "exported")
+    job.progress(1.0, "exported")
     return f"{file_name} is ready to download: {exported.words}"
+
+
+def _reword(error: BaseException) -> BaseException:
+    """Return an error without the command line's option ``--units``."""
+    if not isinstance(error, InputError):
+        return error
+    return InputError(
+        str(error).replace("give --units ", "choose its units, ").replace("--units ", "")
+    )

@@ -1,8 +1,10 @@
-"""What panels draw from a session beyond the snapshot: clouds, error maps, curves. Nothing here
-changes the session."""
+"""What panels draw from a session beyond the snapshot: clouds, error maps, curves, surfaces to
+measure on. Nothing here changes the session."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,17 +14,26 @@ from slviewer.errors import InputError
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
+from slviewer.inspection.regions import Region
+from slviewer.pipeline.measure import (
+    MERGED,
+    MeasuredSurface,
+    Place,
+    load_merged_surface,
+    surface_from_cloud,
+)
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.scan_edits import restrict_cloud
+from slviewer.pipeline.stored_records import is_up_to_date
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.report.maps import PixelCurve
 from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply
-from slviewer.session.scan_edits import load_region
+from slviewer.session.scan_edits import load_region, restriction_inputs
 from slviewer.session.store import Session
+from slviewer.surface.selection import ViewCamera, select_connected, select_in_outline
 
 THUMBNAIL_PX = 240
 
@@ -94,11 +105,6 @@ def whole_cloud(session: Session, name: str) -> ScanCloud:
     return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)
 
 
-def aligned_scans(session: Session) -> AlignedScans:
-    """Load the scans in place, thinned, with the number of scans that see each point."""
-    return view_places(load_placements(session), {}, session)
-
-
 def merged_cloud(session: Session, name: str) -> Ply:
     """Load the merged points of a merge."""
     return read_ply(session.exports / str(session.load_result(f"merge/{name}", only=())[0]["ply"]))
@@ -132,12 +138,9 @@ def pixel_curve(session: Session, pixel: tuple[int, int], axis: Axis) -> PixelCu
 def make_thumbnail(capture: Capture) -> bytes:
     """Return a small JPEG of the capture's texture, or of its brightest kind of frame where it has
     none."""
-    order = ("texture", "white", "phase", "gray")
+    ranks: dict[str, int] = {"texture": 0, "white": 1, "phase": 2, "gray": 3}
     frames = capture.sequence.frames
-    index = min(
-        range(len(frames)),
-        key=lambda k: order.index(frames[k].kind) if frames[k].kind in order else 9,
-    )
+    index = min(range(len(frames)), key=lambda k: ranks.get(frames[k].kind, 9))
     image = capture.stack([index])[0]
     choice = capture.exposure_choice
     if choice is not None:
@@ -146,3 +149,63 @@ def make_thumbnail(capture: Capture) -> bytes:
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small = to_eight_bits(small, capture.sequence.full_scale, int(image.max()))
     return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1])
+
+
+def surface_to_measure(store: Session, name: str) -> MeasuredSurface:
+    """Load a capture's reconstructed cloud, or a merge (``merge/<number>``), as a surface; the last
+    one is kept.
+
+    Raises InputError where there is none, or where what it was made from has changed since.
+    """
+    result = name if name.startswith(MERGED) else f"clouds/{name}"
+    if not store.has_result(result):
+        raise InputError(f"{name} is not reconstructed: reconstruct it in the step Scan first")
+    again = "merge again" if result == name else "reconstruct it again in the step Scan"
+    if not is_up_to_date(store, result):
+        raise InputError(f"the inputs of {name} have changed: {again}, then measure")
+    cut = "" if result == name else str(restriction_inputs(store, [name]))
+    return _read_surface(store.folder, name, store.load_result(result, only=())[0]["hash"], cut)
+
+
+@lru_cache(maxsize=1)
+def _read_surface(folder: Path, name: str, *content: str) -> MeasuredSurface:
+    """Read a surface of a session, whose ``content`` are hashes of what it is made from."""
+    store = Session(folder, None)
+    if name.startswith(MERGED):
+        return load_merged_surface(store, name)
+    cloud = load_scan_cloud(store, name)
+    return surface_from_cloud(store, name, cloud, load_model(store, cloud.model))
+
+
+def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> Place | None:
+    """Return the measured point closest to a ray from origin (3,) mm along direction (3,), in the
+    surface's frame.
+
+    None where the ray passes the surface.
+    """
+    index = nearest(on.points, origin, direction)
+    if index is None:
+        return None
+    return (index[1], index[0]) if on.organised else index[0]
+
+
+def point_at(on: MeasuredSurface, place: Place) -> np.ndarray:
+    """Return the point (3,) mm of a place on the surface."""
+    index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
+    return np.asarray(on.points[index], np.float64)
+
+
+def box_in_view(on: MeasuredSurface, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> Region:
+    """Return the box, with sides along a view's, around what a rectangle shows of a surface: its
+    connected part in the middle. ``low``, ``high`` (2,): corners in the view, 0 ... 1. InputError
+    where it shows no measured point.
+    """
+    corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    chosen = select_in_outline(on.points, view, corners) & on.measured
+    if not chosen.any():
+        raise InputError("the rectangle holds no measured point: drag it over the surface")
+    if on.organised:
+        off = np.linalg.norm(view.project(on.points.astype(np.float64)) - (low + high) / 2, axis=-1)
+        v, u = np.unravel_index(int(np.argmin(np.where(chosen, off, np.inf))), chosen.shape)
+        chosen = select_connected(on.points, (int(u), int(v)), chosen)
+    return Region.around(on.points[chosen].astype(np.float64), view.R_scene_view.T)

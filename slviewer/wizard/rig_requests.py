@@ -1,11 +1,11 @@
 """Requests that concern the session, the devices, the target, and the scene of the simulated
 rig."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from slviewer.wizard.engine import Engine, request
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import CalibrationView, ExposureChange, Level
 
+T = TypeVar("T")
 _CHECKED: dict[CheckVerdict, tuple[Level, str]] = {
     "good": ("good", "the rig is ready to capture"),
     "warning": ("warning", "the rig can capture; the step Rig lists possible improvements"),
@@ -64,7 +65,7 @@ class RigRequests(Engine):
             self._acquisition.stop_stream()
             self._jobs.cancel_all()
             self._session_reader, self._queued = SessionReader(store, self._planner), set()
-            self._show(merge_failure="")
+            self.show(merge_failure="")
             if before:
                 before.close()
             for name in store.recovered:
@@ -93,8 +94,7 @@ class RigRequests(Engine):
                 if rig:
                     raise
                 self._forget_rig(choice, None)
-                self._rig_fault = str(error)
-                self._acquisition.use(None)
+                self._acquisition.use(None, fault=str(error))
                 self._notices.add_failure("Choosing the rig", error)
         elif self._choice is not None:
             _remember(store, rig=dict(self._choice))
@@ -124,13 +124,12 @@ class RigRequests(Engine):
                 key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)
             }
             self._forget_rig(choice, bench)
-            self._rig_fault = ""
             self._acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
 
     def _forget_rig(self, choice: Choice, bench: RigSetup | None) -> None:
         """Forget what was measured with the rig before, and remember the new one."""
         self._choice, self._bench, self._preview = dict(choice), bench, None
-        self._show(preflight=None, exposure_change=None)
+        self.show(preflight=None, exposure_change=None)
 
     @request("Setting the exposure")
     def set_exposure(self, exposure_ms: float | None = None, gain: float | None = None) -> None:
@@ -146,7 +145,7 @@ class RigRequests(Engine):
             return
         with self._lock:  # dragging a slider sends requests from several threads
             before = (session.decision("exposure") or {}).get("exposure_ms") or now.exposure_ms
-            session.decide("exposure", {"exposure_ms": settings.exposure_ms, "gain": settings.gain})
+            session.decide("exposure", asdict(settings))
             several = self._reader.exposures_ms()
             if several and exposure_ms and before:
                 session.decide(
@@ -166,38 +165,44 @@ class RigRequests(Engine):
 
         The snapshot has what they measure; `undo_exposure` sets the ones before.
         """
-        bench = self._bench
         sequence = self._scan_sequence() if for_scan else self._pose_sequence()
         current_ms = self._reader.exposures_ms()
 
-        def work(rig: Rig, progress: Progress) -> ExposureSuggestion:
-            """Take the bracket and choose."""
-            return suggest_exposure(
-                rig, sequence, current_ms=current_ms, budget_s=budget_s, progress=progress
-            )
-
         def done(suggestion: ExposureSuggestion) -> None:
-            """Set what was chosen, if the rig is still in use."""
-            with self._lock:
-                if self._bench is not bench:
-                    return
-                now = self._acquisition.view()
-                before = self._store.decision("exposure") or {
-                    "exposure_ms": now.exposure_ms,
-                    "gain": now.gain,
-                }
-                self._show(
-                    exposure_change=ExposureChange(suggestion, before, self._reader.exposures_ms())
-                )
-                exposures = suggestion.exposures_ms
-                self._decide_exposure(
-                    {"exposure_ms": exposures[0], "gain": suggestion.gain},
-                    exposures if len(exposures) > 1 else (),
-                )
-            self._note_change()
+            """Set what was chosen."""
+            before = self._store.decision("exposure") or self._acquisition.view().exposure
+            self.show(
+                exposure_change=ExposureChange(suggestion, before, self._reader.exposures_ms())
+            )
+            first, *more = suggestion.exposures_ms
+            self._decide_exposure(
+                {"exposure_ms": first, "gain": suggestion.gain}, [first, *more] if more else []
+            )
             self._notices.add("good", suggestion.text())
 
-        self._acquisition.run_task("Suggesting the exposure", work, done)
+        self._use_bench(
+            "Suggesting the exposure",
+            lambda rig, progress: suggest_exposure(
+                rig, sequence, current_ms=current_ms, budget_s=budget_s, progress=progress
+            ),
+            done,
+        )
+
+    def _use_bench(
+        self, title: str, work: Callable[[Rig, Progress], T], done: Callable[[T], None]
+    ) -> None:
+        """Queue work with the open rig; ``done`` is called with its result unless another rig was
+        chosen meanwhile."""
+        bench = self._bench
+
+        def finish(result: T) -> None:
+            """Pass on the result, if the rig is still in use."""
+            with self._lock:
+                if self._bench is bench:
+                    done(result)
+            self._note_change()
+
+        self._acquisition.run_task(title, work, finish)
 
     @request("Undoing the exposure")
     def undo_exposure(self) -> None:
@@ -206,8 +211,8 @@ class RigRequests(Engine):
             change = self._shown.exposure_change
             if change is None:
                 raise InputError("no suggested exposure is set: nothing can be undone")
-            self._show(exposure_change=None)
-            self._decide_exposure(change.exposure_before or {}, change.exposures_before_ms)
+            self.show(exposure_change=None)
+            self._decide_exposure(change.exposure_before, change.exposures_before_ms)
 
     def _decide_exposure(
         self, exposure: Mapping[str, float | None], exposures_ms: Sequence[float]
@@ -222,33 +227,25 @@ class RigRequests(Engine):
     def check_rig(self) -> None:
         """Run the preflight, about 10 s; the snapshot has its result, and the delay that it
         measured is used."""
-        bench = self._bench
 
         def done(result: Preflight) -> None:
-            """Store the result of the check, and report its verdict, if the rig is still in use."""
-            if self._set_preflight(bench, result):
-                self._notices.add(*_CHECKED[result.verdict])
+            """Store the result of the check, and report its verdict."""
+            self._set_preflight(result)
+            self._notices.add(*_CHECKED[result.verdict])
 
-        self._acquisition.run_task(
+        self._use_bench(
             "Checking the rig", lambda rig, progress: preflight(rig, progress=progress), done
         )
 
-    def _set_preflight(self, bench: RigSetup | None, result: Preflight) -> bool:
+    def _set_preflight(self, result: Preflight) -> None:
         """Store the result of a rig check, and use the delay that it measured; the session
-        remembers it with the rig.
-
-        Returns False, and changes nothing, where `bench` is no longer in use.
-        """
-        with self._lock:
-            if self._bench is not bench:
-                return False
-            self._show(preflight=result)
-            if result.settle_ms is not None and self._choice is not None:
-                self._choice = {**self._choice, "settle_ms": result.settle_ms}
-                self._acquisition.set_delay(result.settle_ms)
-                if self.session:
-                    self.session.decide("rig", dict(self._choice))
-            return True
+        remembers it with the rig."""
+        self.show(preflight=result)
+        if result.settle_ms is not None and self._choice is not None:
+            self._choice = {**self._choice, "settle_ms": result.settle_ms}
+            self._acquisition.set_delay(result.settle_ms)
+            if self.session:
+                self.session.decide("rig", self._choice)
 
     @request("Linearising the projector")
     def set_linear_light(self, on: bool) -> None:
@@ -266,11 +263,8 @@ class RigRequests(Engine):
         lists it."""
         if self._choice is None:
             raise InputError("no rig is in use: choose one in the step Rig")
-        now = self._acquisition.view()
-        exposure = {"exposure_ms": now.exposure_ms, "gain": now.gain}
-        save_rig(
-            self._store, name, {**self._choice, **{k: v for k, v in exposure.items() if v}}, what
-        )
+        exposure = {key: value for key, value in self._acquisition.view().exposure.items() if value}
+        save_rig(self._store, name, {**self._choice, **exposure}, what)
 
     @request("Changing the light")
     def set_light(self, light: str) -> None:
@@ -299,7 +293,7 @@ class RigRequests(Engine):
     def _update_board(self) -> None:
         """Apply the current target: print it on the simulated board, and queue the evaluation of
         the poses by it."""
-        board, world = self._parse_board(), self._bench.world if self._bench else None
+        board, world = self._parse_board(), self._scene
         if board and world and board != world.board:
             world.print_board(board)
         self._queue_processing()
@@ -347,21 +341,20 @@ class RigRequests(Engine):
     def place_at_suggestion(self) -> bool:
         """Place the simulated board at the suggested next pose; False, with a notice, where none is
         suggested."""
-        session = self._publisher.refresh().session
-        if session is None or session.suggestion is None:
+        suggestion = self._publisher.refresh().content.suggestion
+        if suggestion is None:
             self._notices.add("error", "no pose is suggested yet: choose a rig and a target first")
             return False
-        return self.place("board", session.suggestion.T_camera_board)
+        return self.place("board", suggestion.T_camera_board)
 
     @property
     def _world(self) -> SimulatedWorld:
         """The scene of the simulated rig. Raises InputError where the rig is a real one."""
-        world = self._bench.world if self._bench else None
-        if world is None:
+        if self._scene is None:
             raise InputError(
                 "objects can be placed only before the simulated rig: choose it in the step Rig"
             )
-        return world
+        return self._scene
 
     # what captures project
 

@@ -1,16 +1,14 @@
-"""Reads what a session's files contain, for the panels. Nothing is cached but what would be read
-again the same."""
+"""Reads what a session's files contain, for the panels. Descriptions of captures and results that
+did not change are not read again (`session.reading.identify`); features of poses are kept."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from slviewer.calibration.next_pose import outline_px
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError, SessionError
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.calibrate import load_last_verdict
@@ -27,8 +25,9 @@ from slviewer.pipeline.models import (
     recommended_model,
     rejection_reason,
 )
-from slviewer.pipeline.scale import describe_scale, scale_factor
-from slviewer.pipeline.stored_records import Stored, captures_of, read_record
+from slviewer.pipeline.scale import describe_scale
+from slviewer.pipeline.stored_records import Stored, captures_of, load_record, load_stored
+from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Placement
@@ -36,12 +35,12 @@ from slviewer.records.reconstruction import Reconstruction
 from slviewer.session.capture import Capture
 from slviewer.session.inspection_plan import list_plans
 from slviewer.session.names import join_names
-from slviewer.session.scan_edits import list_edits, load_region, restriction_inputs
+from slviewer.session.nominal import NOMINALS
+from slviewer.session.scan_edits import list_edits, load_region
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard.notices import describe_failure
-from slviewer.wizard.planner import Planner
-from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
+from slviewer.wizard.pose_plan import PlanInput, Planner, PoseFeatures, PosePlan
 from slviewer.wizard.snapshot import (
     CalibrationView,
     ExportView,
@@ -51,26 +50,24 @@ from slviewer.wizard.snapshot import (
     ScanView,
     SessionView,
 )
-from slviewer.wizard.surfaces import list_nominals
 
-MOST_CACHED = 500
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class SessionReader:
-    """Reads one session repeatedly, and caches what is slow to read by its content hash."""
+    """Reads one session repeatedly."""
 
     def __init__(self, session: Session, planner: Planner) -> None:
         self.session = session
         self.thumbnails: dict[str, bytes] = {}  # by the content hash of a capture
         self._planner = planner
-        self._cache: dict[Any, Any] = {}
-        self._unreadable: dict[tuple[str, str, str], str] = {}  # by name, content hash and target
-        self._features: dict[tuple[str, str], PoseFeatures] = {}  # of poses that are not judged yet
+        # why poses cannot be evaluated, by name, content hash and target
+        self.unreadable: dict[tuple[str, str, str], str] = {}
+        # by content hash and target, also of poses that are not judged yet
+        self._features: dict[tuple[str, str], PoseFeatures] = {}
         self._faults: list[str] = []  # what could not be read this time
-        # of the captures that can be read, and of results that are fresh, this time
-        self._captures: dict[str, Capture] = {}
-        self._hashes: dict[str, str] = {}
+        self._captures: dict[str, Capture] = {}  # that can be read, this time
 
     def add_features(self, capture: Capture, target: str, observation: Observation) -> None:
         """Store the features of a pose whose frames are still being examined, for the plan of the
@@ -78,10 +75,6 @@ class SessionReader:
         sigma = observation.samples.sigma if observation.samples else np.zeros(0)
         seen = observation.points, observation.camera, observation.projector
         self._features[capture.hash, target] = _make_features(*seen, sigma)
-
-    def add_unreadable(self, capture: Capture, why: str) -> None:
-        """Store why a pose cannot be evaluated, so that it is not tried again."""
-        self._unreadable[capture.name, capture.hash, self.target()] = why
 
     def target(self) -> str:
         """Return the board's notation, empty where it is unknown or a board of a plugin that is not
@@ -98,7 +91,7 @@ class SessionReader:
         return (
             capture.role == "calibration"
             and bool(target)
-            and (capture.name, capture.hash, target) not in self._unreadable
+            and (capture.name, capture.hash, target) not in self.unreadable
             and self._load_judgement(capture, target) is None
         )
 
@@ -131,15 +124,13 @@ class SessionReader:
         unknown = explain_board(find_target(session))
         self._faults = [*faults.values(), *session.decision_faults(), *filter(None, [unknown])]
         self._captures = {capture.name: capture for capture in sound}
-        calibration = self._attempt("the calibration", self._read_calibration, None)
+        calibration = self._attempt("the calibration", self._read_calibration)
         scans = [capture for capture in sound if capture.role == "scan"]
-        models = calibration.models if calibration else ()
-        self._hashes = self._read_hashes([scan.name for scan in scans], models)
         poses, plan, pending = self._read_poses(target, calibration, rig, focal_px)
-        records = self._read_records({model: scale_factor(session, model) for model in models})
+        records = tuple(self._read_records())
         labels = session.valid_decision("names") or {}
-        verdict = self._attempt("the verdict", partial(load_last_verdict, session), None)
-        judged = None if calibration is None else self._load_record("calibration/stereo").verdict
+        verdict = self._attempt("the verdict", load_last_verdict, session)
+        judged = calibration and load_record(session, ModelCalibration, "stereo").verdict
         return SessionView(
             folder=session.folder,
             target=target,
@@ -157,7 +148,7 @@ class SessionReader:
             deleted_measurements=sum(
                 name.startswith(f"{Measurement.kind}/") for name in session.deleted_results()
             ),
-            nominals=list_nominals(session.folder),
+            nominals=tuple(sorted(each.name for each in (session.folder / NOMINALS).glob("[!.]*"))),
             plans=list_plans(session.folder),
             exports=tuple(
                 ExportView(each.name, each, each.stat().st_size)
@@ -167,36 +158,23 @@ class SessionReader:
             exposures_ms=self.exposures_ms(),
             is_linear=self.levels() is not None,
             aligns_scans=bool(session.valid_decision("align_scans")),
-            region=self._attempt(
-                "the region", partial(load_region, session, even_if_off=True), None
-            ),
+            region=self._attempt("the region", load_region, session, even_if_off=True),
             region_is_on=bool((session.valid_decision("region") or {}).get("on")),
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
             faults=tuple(dict.fromkeys(self._faults)),
         )
 
-    def _read_hashes(self, scans: Sequence[str], models: Sequence[str]) -> dict[str, str]:
-        """Read the hashes of current inputs of results: captures, edits of scans, calibrations of
-        these models and corrections of scale that are fresh."""
-        hashes: dict[str, str] = self._attempt(
-            "edits and region", partial(restriction_inputs, self.session, scans), {}
-        )
-        hashes |= {name: capture.hash for name, capture in self._captures.items()}
-        for name in (*(f"calibration/{model}" for model in models), *self._list_results("scale/")):
-            meta = self._load_meta(name)
-            if not _has_changed(meta.get("inputs", {}), hashes):
-                hashes[name] = meta["hash"]
-        return hashes
-
-    def _attempt(self, what: str, read: Callable[[], T], otherwise: T) -> T:
-        """Return what `read()` returns, or `otherwise` where that fails, which is one of the
-        session's faults then."""
+    def _attempt(
+        self, what: str, read: Callable[P, T], *args: P.args, **options: P.kwargs
+    ) -> T | None:
+        """Return what `read` returns, or None where it fails, which is one of the session's faults
+        then."""
         try:
-            return read()
+            return read(*args, **options)
         except Exception as error:  # damaged files may make their reader fail in any way
             self._faults.append(describe_failure(f"Reading {what}", error))
-            return otherwise
+            return None
 
     # poses
 
@@ -216,112 +194,93 @@ class SessionReader:
     ) -> tuple[tuple[PoseView, ...], PosePlan | None, PlanInput | None]:
         """Return (the poses, the plan after them, the input of the final plan where this one is
         interim)."""
-        states, features = self._judge_poses(target, calibration)
-        camera, projector = rig.camera, rig.projector
-        if states:
-            first = self._captures[next(iter(states))]
-            camera, projector = first.size, first.sequence.projector_size
-        plan = given = None
-        if target and camera is not None and projector is not None:
-            stereo = None if calibration is None or calibration.refused else calibration.stereo
-            hashes = [(name, self._captures[name].hash) for name in features]
-            if stereo:
-                hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
-            given = PlanInput(
-                Board.parse(target),
-                camera,
-                projector,
-                features,
-                stereo,
-                focal_px,
-                sum(state == "refused" for state, _ in states.values()),
-                tuple(hashes),
+        captures = [each for each in self._captures.values() if each.role == "calibration"]
+        judged = [(pose, *self._judge(pose, target, calibration)) for pose in captures]
+        features = {pose.name: seen for pose, _, _, seen in judged if seen}
+        refused = sum(state == "refused" for _, state, _, _ in judged)
+        given = self._plan_input(target, calibration, rig, focal_px, features, refused)
+        plan, is_final = self._planner.look_up(given) if given else (None, True)
+        poses = plan.poses if plan else {}
+        used_px = calibration.stereo.pose_rms_px if calibration else {}
+        views = tuple(
+            PoseView(
+                name=pose.name,
+                state=state,
+                why=why,
+                created=str(pose.meta.get("created", "")),
+                T_camera_board=(T := poses.get(pose.name)),
+                board_px=outline_px(given.board, plan.lens, T)
+                if given and plan and T is not None
+                else None,
+                rms_px=used_px.get(pose.name) if state == "used" else None,
+                thumbnail=self.thumbnails.get(pose.hash, b""),
             )
-            plan, is_final = self._planner.look_up(given)
-            given = None if is_final else given
-        rms_px = calibration.stereo.pose_rms_px if calibration else {}
-        views = []
-        for name, (state, why) in states.items():
-            pose, T, board_px = self._captures[name], None, None
-            if plan and (T := plan.poses.get(name)) is not None:
-                board_px = outline_px(Board.parse(target), plan.lens, T)
-            views.append(
-                PoseView(
-                    name=name,
-                    state=state,
-                    why=why,
-                    created=str(pose.meta.get("created", "")),
-                    T_camera_board=T,
-                    calibrated=state == "used",
-                    board_px=board_px,
-                    rms_px=rms_px.get(name) if state == "used" else None,
-                    thumbnail=self.thumbnails.get(pose.hash, b""),
-                )
-            )
-        return tuple(views), plan, given
+            for pose, state, why, _ in judged
+        )
+        return views, plan, None if is_final else given
 
-    def _judge_poses(
-        self, target: str, calibration: CalibrationView | None
-    ) -> tuple[dict[str, tuple[PoseState, str]], dict[str, PoseFeatures]]:
-        """Return {pose: its state and the reason}, and the features of those that count, early ones
-        until a pose is judged."""
-        excluded = self.session.valid_decision("excluded") or {}
-        states: dict[str, tuple[PoseState, str]] = {}
-        features = {}
-        for pose in self._captures.values():
-            if pose.role != "calibration":
-                continue
-            meta = self._load_judgement(pose, target)
-            states[pose.name] = self._determine_pose_state(pose, target, meta, calibration)
-            if pose.name in excluded:
-                states[pose.name] = "excluded", excluded[pose.name]
-            if states[pose.name][0] in ("excluded", "refused"):
-                continue
-            seen = self._features.get((pose.hash, target))
-            if meta is not None:
-                load = partial(self._load_features, pose.name, meta)
-                seen = self._attempt(f"the features of {pose.name}", load, None)
-            if seen:
-                features[pose.name] = seen
-        return states, features
-
-    def _determine_pose_state(
+    def _plan_input(
         self,
-        pose: Capture,
         target: str,
-        meta: Mapping[str, Any] | None,
         calibration: CalibrationView | None,
-    ) -> tuple[PoseState, str]:
-        """Return the state of a target pose that is not excluded, and the reason, which is empty
-        where there is none."""
-        if why := self._unreadable.get((pose.name, pose.hash, target)):
-            return "refused", why
+        rig: RigView,
+        focal_px: float | None,
+        features: Mapping[str, PoseFeatures],
+        refused: int,
+    ) -> PlanInput | None:
+        """Return what the next pose is planned from; None before target and sizes are known."""
+        camera, projector = rig.camera, rig.projector
+        for first in [each for each in self._captures.values() if each.role == "calibration"][:1]:
+            camera, projector = first.size, first.sequence.projector_size
+        if not target or camera is None or projector is None:
+            return None
+        stereo = None if calibration is None or calibration.refused else calibration.stereo
+        hashes = [(name, self._captures[name].hash) for name in features]
+        if stereo:
+            hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
+        return PlanInput(
+            Board.parse(target), camera, projector, features, stereo, focal_px, refused,
+            tuple(hashes),
+        )  # fmt: skip
+
+    def _judge(
+        self, pose: Capture, target: str, calibration: CalibrationView | None
+    ) -> tuple[PoseState, str, PoseFeatures | None]:
+        """Return the state of a target pose, the reason, which is empty where there is none, and
+        the features of one that counts, early ones until it is judged."""
+        excluded = self.session.valid_decision("excluded") or {}
+        if pose.name in excluded:
+            return "excluded", excluded[pose.name], None
+        if why := self.unreadable.get((pose.name, pose.hash, target)):
+            return "refused", why, None
+        meta = self._load_judgement(pose, target)
         if meta is None:
-            return "judging", ""
+            return "judging", "", self._features.get((pose.hash, target))
         if meta["refused"]:
-            return "refused", str(meta["refused"])
+            return "refused", str(meta["refused"]), None
+        features = self._attempt(
+            f"the features of {pose.name}", self._load_features, pose, target, meta
+        )
         if calibration:
             if self._load_meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
-                return "used", ""
+                return "used", "", features
             why = calibration.stereo.excluded.get(pose.name, "")
             # such a pose was included again since
             if why and not why.startswith("excluded by the operator"):
-                return "unused", why
-        return "good", ""
+                return "unused", why, features
+        return "good", "", features
 
-    def _load_features(self, name: str, meta: Mapping[str, Any]) -> PoseFeatures:
-        """Load the features of a pose and the median noise of its projector coordinates; cached by
-        content hash."""
-
-        def load() -> PoseFeatures:
-            """Load the features from the pose's saved result."""
+    def _load_features(self, pose: Capture, target: str, meta: Mapping[str, Any]) -> PoseFeatures:
+        """Load the features of a pose and the median noise of its projector coordinates, unless
+        they are known."""
+        key = pose.hash, target
+        if key not in self._features:
             # older versions saved no samples
             names = {"points", "camera", "projector", "samples_sigma"} & set(meta["arrays"])
-            arrays = self.session.load_result(f"poses/{name}", only=names)[1]
+            arrays = self.session.load_result(f"poses/{pose.name}", only=names)[1]
             sigma = arrays.pop("samples_sigma", np.zeros(0))
-            return _make_features(**arrays, sigma=sigma)
-
-        return self._get_cached(("features", meta["hash"]), load)  # type: ignore[no-any-return]
+            self._features[key] = _make_features(**arrays, sigma=sigma)
+        return self._features[key]
 
     # calibration
 
@@ -333,10 +292,7 @@ class SessionReader:
         if "stereo" not in models:
             return None
         meta = self._load_meta("calibration/stereo")
-        made_of = ("stereo", meta["hash"], tuple(self._captures)[:1])
-        stereo: StereoModel | None = self._get_cached(
-            made_of, partial(load_stereo_if_complete, session)
-        )
+        stereo = load_stereo_if_complete(session)
         if stereo is None:
             return None
         fits = {model: self._load_fit(model) for model in models if model != "stereo"}
@@ -364,17 +320,11 @@ class SessionReader:
     def _load_fit(self, model: str) -> Any:
         """Load the figures of a model's fit; None where another version saved a model that cannot
         be read."""
-        name = f"calibration/{model}"
-
-        def describe() -> Any:
-            """Return the figures of the model itself: version 0.2 stored none."""
-            with suppress(SessionError):
-                return load_model(self.session, model).describe()
-            return None
-
-        return self._load_record(name).fit or self._get_cached(
-            ("fit", self._load_meta(name)["hash"]), describe
-        )
+        if fit := load_record(self.session, ModelCalibration, model).fit:
+            return fit
+        with suppress(SessionError):  # version 0.2 stored none
+            return load_model(self.session, model).describe()
+        return None
 
     def _describe_changes(self, inputs: Mapping[str, str]) -> str:
         """Describe which poses of a calibration were retaken, deleted or excluded since; empty
@@ -390,27 +340,14 @@ class SessionReader:
 
     # verifications, scans, merges, measurements
 
-    def _read_records(self, factors: Mapping[str, float]) -> tuple[Stored[Any], ...]:
-        """Read all records of existing captures, with whether they are stale; ``factors``: {model:
-        correction of scale}."""
-
-        def read(result: str) -> Stored[Any] | None:
-            """Read one record by its result name; None where a capture of it is gone."""
-            name, record = result.partition("/")[2], self._load_record(result)
-            if not self._captures.keys() >= set(captures_of(name, record)):
-                return None
-            hashes = self._hashes
-            stale = _has_changed(record.inputs, hashes) or _has_changed(record.scales, factors)
-            if not stale:  # others are made from it
-                hashes[result] = self._load_meta(result)["hash"]
-            labels = self.session.valid_decision(record.labels) or {}
-            return Stored(name, str(labels.get(name) or record.label(name)), record, stale)
-
-        # which are made from merges
-        kinds = sorted(RECORDS, key=lambda kind: kind == Measurement.kind)
-        names = [name for kind in kinds for name in self._list_results(f"{kind}/")]
-        records = [self._attempt(name, partial(read, name), None) for name in names]
-        return tuple(record for record in records if record is not None)
+    def _read_records(self) -> Iterator[Stored[Any]]:
+        """Read all records of existing captures, with whether they are stale."""
+        for result in self.session.result_names():
+            kind, _, name = result.partition("/")
+            if kind in RECORDS:
+                stored = self._attempt(result, load_stored, self.session, RECORDS[kind], name)
+                if stored and self._captures.keys() >= set(captures_of(name, stored.record)):
+                    yield stored
 
     def _read_scan(
         self, capture: Capture, records: Sequence[Stored[Any]], labels: Mapping[str, str]
@@ -420,10 +357,8 @@ class SessionReader:
         own = {type(each.record): each for each in records if each.name == capture.name}
         found, place = own.get(Reconstruction), own.get(Placement)
         edits, undone = self._attempt(
-            f"the edits of {capture.name}",
-            partial(list_edits, self.session, capture.name),
-            (tuple[str, ...](), 0),
-        )
+            f"the edits of {capture.name}", list_edits, self.session, capture.name
+        ) or ((), 0)
         return ScanView(
             name=capture.name,
             label=str(labels.get(capture.name, capture.name)),
@@ -438,29 +373,9 @@ class SessionReader:
             undone_edits=undone,
         )
 
-    # files
-
-    def _list_results(self, prefix: str) -> list[str]:
-        """List the names of the results with a prefix, in natural order."""
-        return [name for name in self.session.result_names() if name.startswith(prefix)]
-
-    def _load_record(self, result: str) -> Any:
-        """Load a record by its result name; cached by content hash."""
-        kind, meta = RECORDS[result.partition("/")[0]], self._load_meta(result)
-        return self._get_cached(("record", meta["hash"]), lambda: read_record(kind, meta))
-
     def _load_meta(self, result: str) -> dict[str, Any]:
         """Load the `meta` of a result, without its arrays."""
         return self.session.load_result(result, only=())[0]
-
-    def _get_cached(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return the cached value of a key, computed by `make()` where missing; a full cache is
-        cleared."""
-        if key not in self._cache:
-            if len(self._cache) > MOST_CACHED:
-                self._cache.clear()
-            self._cache[key] = make()
-        return self._cache[key]
 
 
 def _make_features(
@@ -472,11 +387,6 @@ def _make_features(
     return PoseFeatures(
         points, camera, projector, float(np.median(known)) if known.size else np.nan
     )
-
-
-def _has_changed(used: Mapping[str, object], now: Mapping[str, object]) -> bool:
-    """Whether any name of `used` is missing from `now` or has another value there."""
-    return any(now.get(name) != value for name, value in used.items())
 
 
 def missing_for_splined(session: Session) -> str:

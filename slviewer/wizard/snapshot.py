@@ -42,11 +42,11 @@ is reported."""
 @dataclass(frozen=True)
 class ExposureChange:
     """Exposures that were suggested and set, and what they replaced: exposure and gain as the
-    session remembers them, None where it did not, and the exposures of each capture, none where it
+    session remembers them, and the exposures of each capture, none where it
     was a single one."""
 
     suggestion: ExposureSuggestion
-    exposure_before: dict[str, float | None] | None
+    exposure_before: dict[str, float | None]
     exposures_before_ms: tuple[float, ...]
 
 
@@ -111,6 +111,11 @@ class RigView:
     turntable: str = ""  # its name; empty: the rig has none
 
     @property
+    def exposure(self) -> dict[str, float | None]:
+        """Its exposure and gain, as the session remembers them."""
+        return {"exposure_ms": self.exposure_ms, "gain": self.gain}
+
+    @property
     def is_idle(self) -> bool:
         """Whether it is open, and nothing is captured."""
         return self.state == "open" and self.capture is None
@@ -123,7 +128,7 @@ class RigView:
 
 @dataclass(frozen=True, eq=False)
 class PoseView:
-    """One target pose. `T_camera_board` (4, 4) mm is exact where `calibrated`, else approximate,
+    """One target pose. `T_camera_board` (4, 4) mm is exact where it is "used", else approximate,
     None if unknown; `rms_px` is (camera, projector) reprojection; `thumbnail` a JPEG, empty until
     made; `board_px` (4, 2) the board's outline in the camera's px.
     """
@@ -133,7 +138,6 @@ class PoseView:
     why: str
     created: str
     T_camera_board: np.ndarray | None
-    calibrated: bool
     board_px: np.ndarray | None
     rms_px: tuple[float, float] | None
     thumbnail: bytes = field(repr=False)
@@ -350,6 +354,7 @@ class Snapshot:
     preparing: float | None = (
         None  # share of the kernels compiled in the background; None while none are
     )
+    brightness: Brightness = ""  # of the camera's image in white light
 
     @property
     def is_busy(self) -> bool:
@@ -357,9 +362,14 @@ class Snapshot:
         return self.job is not None and not self.job.background
 
     @property
+    def content(self) -> SessionView:
+        """The content of the session, which is empty until one is open."""
+        return self.session or SessionView(Path(), "", "")
+
+    @property
     def calibration(self) -> CalibrationView | None:
         """The session's calibration; None where there is none."""
-        return self.session.calibration if self.session else None
+        return self.content.calibration
 
     def step(self, key: str) -> StepView:
         """Return the step called `key`."""
@@ -367,13 +377,11 @@ class Snapshot:
 
     def pose(self, name: str) -> PoseView | None:
         """Return the pose called `name`; None where there is none."""
-        poses = self.session.poses if self.session else ()
-        return next((pose for pose in poses if pose.name == name), None)
+        return next((pose for pose in self.content.poses if pose.name == name), None)
 
     def scan(self, name: str) -> ScanView | None:
         """Return the scan called `name`; None where there is none."""
-        scans = self.session.scans if self.session else ()
-        return next((scan for scan in scans if scan.name == name), None)
+        return next((scan for scan in self.content.scans if scan.name == name), None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from slviewer.pipeline.stored_records import Stored
 from slviewer.records.measurement import DECIDED, Measurement, Quantity
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.report.surfaces import section_plot
-from slviewer.wizard.surfaces import place_at
+from slviewer.wizard.result_views import place_at
 
 CENTRE = np.array([10.0, 20.0, 500.0])
 TOP = CENTRE - np.array([0.0, 0.0, 30.0])

@@ -14,7 +14,7 @@ from playwright.sync_api import (
     expect,
 )
 
-from slviewer.wizard.engine import Timing
+from slviewer.wizard.service import Timing
 
 SIZE: ViewportSize = {"width": 1280, "height": 800}
 CALM = Timing(previews_per_s=2.0, trials=20)

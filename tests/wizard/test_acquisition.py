@@ -19,9 +19,10 @@ from slviewer.errors import DeviceError, SessionError
 from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.simulation.rig import letter
-from slviewer.wizard.acquisition import Acquisition, CaptureRequest
+from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.jobs import Jobs
 from slviewer.wizard.notices import Notices
+from slviewer.wizard.service import Timing
 from slviewer.wizard.snapshot import CaptureProgress, Level
 
 pytestmark = pytest.mark.computes
@@ -54,9 +55,8 @@ class Bench:
             self.notices,
             self._record_progress,
             lambda frame, _: self.previews.append(frame),
-            retry_s=0.1,
-            previews_per_s=50.0,
-            clock=clock,
+            Timing(retry_s=0.1, previews_per_s=50.0),
+            clock,
         )
         self.rig: Rig
         self.faults: Faults
@@ -66,12 +66,11 @@ class Bench:
         self.acquisition.use(self.rig)
         until(lambda: self.acquisition.view().state == "open")
 
-    def request(self, name: str, sequence: PatternSequence = SEQUENCE) -> CaptureRequest:
-        return CaptureRequest(
+    def request(self, name: str) -> tuple[str, PatternSequence, Callable[[CapturedFrames], None]]:
+        return (
             name,
-            sequence,
+            SEQUENCE,
             lambda taken: self.saved.append((name, taken.frames.copy(), taken.settings)),
-            lambda: None,
         )
 
     def previews_go_on(self) -> None:
@@ -101,14 +100,14 @@ def bench() -> Iterator[Bench]:
 
 def test_previews_and_captures(bench: Bench) -> None:
     with raises(DeviceError, "too early", "rig"):
-        bench.acquisition.capture(bench.request("too early"))
+        bench.acquisition.capture(*bench.request("too early"))
     bench.open()
     view = bench.acquisition.view()
     assert (view.camera, view.projector, view.exposure_ms) == ((160, 120), (912, 1140), 1.0)
     bench.previews_go_on()
     assert bench.previews[0] is not bench.previews[1] and bench.previews[-1].mean() > 30
     for name in ("one", "two"):
-        bench.acquisition.capture(bench.request(name))
+        bench.acquisition.capture(*bench.request(name))
     until(lambda: bench.acquisition.idle)
     assert [name for name, _, _ in bench.saved] == ["one", "two"]
     assert bench.saved[0][1].shape == (FRAMES, 120, 160) and bench.saved[0][2].exposure_ms == 1.0
@@ -134,8 +133,8 @@ def test_exposure_and_light_take_effect(bench: Bench) -> None:
 def test_a_fault_ends_one_capture_and_nothing_else(bench: Bench, fault, frame: int) -> None:
     bench.open()
     bench.faults.plan(fault, frame)
-    bench.acquisition.capture(bench.request("broken"))
-    bench.acquisition.capture(bench.request("waiting"))
+    bench.acquisition.capture(*bench.request("broken"))
+    bench.acquisition.capture(*bench.request("waiting"))
     until(lambda: len(bench.texts) >= 2)
     assert (
         missing_facts(
@@ -146,7 +145,7 @@ def test_a_fault_ends_one_capture_and_nothing_else(bench: Bench, fault, frame: i
     assert bench.levels == ["error", "good"]
     assert bench.saved == [] and bench.acquisition.idle
     bench.previews_go_on()
-    bench.acquisition.capture(bench.request("after"))
+    bench.acquisition.capture(*bench.request("after"))
     until(lambda: bench.acquisition.idle)
     assert [name for name, _, _ in bench.saved] == [
         "after"
@@ -186,7 +185,7 @@ def test_devices_that_do_not_open_are_tried_again_and_reported_once(
         "the camera is not there: plug it in"
     ]
     with raises(DeviceError, "in vain"):
-        bench.acquisition.capture(bench.request("in vain"))
+        bench.acquisition.capture(*bench.request("in vain"))
     monkeypatch.undo()
     clock.now_s = 0.33
     until(lambda: bench.acquisition.view().state == "open")
@@ -198,12 +197,9 @@ def test_a_disk_that_refuses_loses_the_capture_but_not_the_rig(bench: Bench) -> 
         raise SessionError("the disk is full: free some space")
 
     bench.open()
-    followed: list[bool] = []
-    bench.acquisition.capture(
-        CaptureRequest("pose_01", SEQUENCE, save, lambda: followed.append(True))
-    )
+    bench.acquisition.capture("pose_01", SEQUENCE, save)
     until(lambda: bool(bench.texts))
-    assert bench.texts == ["pose_01: the disk is full: free some space"] and followed == []
+    assert bench.texts == ["pose_01: the disk is full: free some space"]
     assert bench.acquisition.view().state == "open"
     bench.previews_go_on()
 
@@ -222,7 +218,7 @@ def test_a_capture_can_be_cancelled(bench: Bench) -> None:
         grab(out)
 
     bench.rig.camera.grab = grab_slowly  # type: ignore[method-assign]
-    bench.acquisition.capture(bench.request("long"))
+    bench.acquisition.capture(*bench.request("long"))
     assert in_third_frame.wait(HANG_S)
     bench.acquisition.cancel()
     cancelled.set()
@@ -234,7 +230,7 @@ def test_a_capture_can_be_cancelled(bench: Bench) -> None:
 
 def test_previews_go_on_while_the_worker_is_busy(bench: Bench) -> None:
     bench.open()
-    jobs = Jobs(bench.notices, lambda: None)
+    jobs = Jobs(bench.notices, lambda: None, lambda: None)
     end = threading.Event()
     jobs.submit("Busy", lambda report: end.wait(HANG_S))
     bench.previews_go_on()

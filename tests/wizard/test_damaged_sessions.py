@@ -118,7 +118,7 @@ def test_the_page_shows_the_present_state_while_a_file_is_damaged(
 ) -> None:
     (folder / "decisions.json").write_text("{")
     assert not operator.choose_target("circles:7x5:20")
-    operator.set_autopilot_status("going on")
+    operator.show(autopilot="going on")
     failed = operator.wait_for(
         lambda snapshot: bool(snapshot.session and snapshot.session.faults), HANG_S
     )

@@ -18,7 +18,6 @@ from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.presets import complementary
 from slviewer.pipeline.capture import save_frames
 from slviewer.session.store import Session
-from slviewer.wizard.acquisition import CaptureRequest
 
 __all__ = ["bench"]
 
@@ -71,7 +70,7 @@ def test_a_task_can_be_cancelled_and_waits_for_its_turn(bench: Bench) -> None:
             time.sleep(0.01)
 
     bench.open()
-    bench.acquisition.capture(bench.request("first"))
+    bench.acquisition.capture(*bench.request("first"))
     bench.acquisition.run_task("Checking the rig", task, done.append)
     assert bench.acquisition.names() == ["first", "Checking the rig"] or began.is_set()
     assert began.wait(HANG_S)
@@ -121,13 +120,10 @@ def test_a_capture_in_several_exposures_is_saved_whole(bench: Bench, tmp_path: P
     with Session.create(tmp_path / "session") as store:
         bench.open()
         bench.acquisition.capture(
-            CaptureRequest(
-                "pose_01",
-                SEQUENCE,
-                lambda taken: save_frames(store, "pose_01", "pose", taken),
-                lambda: None,
-                (4.0, 0.5),
-            )
+            "pose_01",
+            SEQUENCE,
+            lambda taken: save_frames(store, "pose_01", "pose", taken),
+            (4.0, 0.5),
         )
         until(lambda: bench.acquisition.idle)
         assert {capture.frames for capture in bench.progress} == {2 * FRAMES} and bench.texts == []
@@ -144,10 +140,7 @@ def test_a_fault_while_exposures_change_leaves_no_capture_and_the_old_exposure(
 ) -> None:
     bench.open()
     bench.faults.plan("unplugged", 5)
-    request = bench.request("broken")
-    bench.acquisition.capture(
-        CaptureRequest("broken", SEQUENCE, request.save, lambda: None, (0.5, 4.0))
-    )
+    bench.acquisition.capture(*bench.request("broken"), (0.5, 4.0))
     until(lambda: len(bench.texts) >= 2)
     assert missing_facts(bench.texts[0], "discarded") == [] and bench.levels == ["error", "good"]
     assert bench.saved == []
@@ -160,12 +153,9 @@ def test_a_colour_camera_leaves_its_texture_in_the_session(bench: Bench, tmp_pat
     with Session.create(tmp_path / "session") as store:
         bench.open()
         bench.acquisition.capture(
-            CaptureRequest(
-                "scan_01",
-                SEQUENCE,
-                lambda taken: save_frames(store, "scan_01", "scan", taken),
-                lambda: None,
-            )
+            "scan_01",
+            SEQUENCE,
+            lambda taken: save_frames(store, "scan_01", "scan", taken),
         )
         until(lambda: bench.acquisition.idle and bool(store.capture_names()))
         texture = store.load_capture("scan_01").texture
@@ -197,7 +187,7 @@ def test_another_rig_ends_what_the_one_before_was_doing(bench: Bench) -> None:
     bench.acquisition.set_light("dark")
     bench.acquisition.run_task("Checking the rig", task, done.append)
     assert began.wait(HANG_S)
-    bench.acquisition.capture(bench.request("waits"))
+    bench.acquisition.capture(*bench.request("waits"))
     other = replace(bench.rig, name="another")
     bench.acquisition.use(other)
     # not before the task has ended: nobody may close what it saves into

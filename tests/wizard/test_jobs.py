@@ -24,7 +24,7 @@ def notices() -> Notices:
 
 @pytest.fixture
 def jobs(notices: Notices) -> Iterator[Jobs]:
-    jobs = Jobs(notices, lambda: None)
+    jobs = Jobs(notices, lambda: None, lambda: None)
     yield jobs
     jobs.close()
 
@@ -191,7 +191,7 @@ def test_a_failure_becomes_a_notice_and_later_jobs_go_on(
 
 
 def test_closing_ends_everything(notices: Notices) -> None:
-    jobs = Jobs(notices, lambda: None)
+    jobs = Jobs(notices, lambda: None, lambda: None)
     started, wake, woke = threading.Event(), threading.Event(), threading.Event()
 
     def sleep(report):

@@ -24,7 +24,7 @@ from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.wizard import live_scan
-from slviewer.wizard.live_frames import Stream
+from slviewer.wizard.acquisition import Stream
 from slviewer.wizard.live_scan import LiveCloud, LiveModel
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Level

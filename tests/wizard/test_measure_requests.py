@@ -18,6 +18,7 @@ from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.stored_records import list_records
 from slviewer.records.measurement import Measurement
 from slviewer.session.inspection_plan import read_plan
+from slviewer.session.names import plain_name
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
@@ -25,10 +26,9 @@ from slviewer.simulation.mesh import demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
-from slviewer.wizard.measure_requests import plain_name
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.result_views import place_at, point_at, surface_to_measure
 from slviewer.wizard.snapshot import SessionView
-from slviewer.wizard.surfaces import Surfaces, list_nominals, place_at, point_at
 
 pytestmark = pytest.mark.computes
 
@@ -148,7 +148,7 @@ def test_what_cannot_be_measured_is_said_and_nothing_kept(operator: Operator) ->
 
 
 def test_a_surface_of_what_has_changed_is_not_measured(operator: Operator) -> None:
-    store, surfaces = operator.session, Surfaces()
+    store = operator.session
     assert store is not None
     meta, arrays = store.load_result("clouds/balls")
     kept = {key: value for key, value in meta.items() if key not in ("hash", "arrays", "checksums")}
@@ -156,9 +156,9 @@ def test_a_surface_of_what_has_changed_is_not_measured(operator: Operator) -> No
         "clouds/balls", {**kept, "inputs": {**kept["inputs"], "balls": "other"}}, arrays
     )
     with raises(InputError, "balls"):
-        surfaces.load(store, "balls")
+        surface_to_measure(store, "balls")
     store.save_result("clouds/balls", kept, arrays)
-    assert surfaces.load(store, "balls").organised
+    assert surface_to_measure(store, "balls").organised
 
 
 @pytest.mark.slow
@@ -174,7 +174,7 @@ def test_a_nominal_model_is_looked_at_kept_and_compared_with(
     trimesh.creation.box((5.6, 5.0, 1.6)).export(tmp_path / "inch.stl")
     assert operator.upload_nominal("inch.stl", (tmp_path / "inch.stl").read_bytes())
     session = now(operator)
-    assert session.nominals == ("My_ammonite.ply", "inch.stl") == list_nominals(session.folder)
+    assert session.nominals == ("My_ammonite.ply", "inch.stl")
     assert sorted(each.name for each in (session.folder / "nominal").iterdir()) == list(
         session.nominals
     )
@@ -189,5 +189,6 @@ def test_a_nominal_model_is_looked_at_kept_and_compared_with(
 
 
 def test_names_of_uploaded_files_are_harmless() -> None:
-    assert plain_name("../../a b<c>.stl") == "a_b_c_.stl" and plain_name("...") == "nominal"
-    assert len(plain_name("x" * 500 + ".stl")) == 100 and plain_name("é.stl") == "_.stl"
+    assert plain_name("a b<c>.stl", "model") == "a_b_c_.stl"
+    assert plain_name("...", "model") == "model"
+    assert len(plain_name("x" * 500 + ".stl", "")) == 100 and plain_name("é.stl", "") == "_.stl"

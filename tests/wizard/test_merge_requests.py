@@ -10,6 +10,7 @@ from wizard_events import HANG_S
 
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
+from slviewer.pipeline.merge import load_placements, view_places
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.stored_records import Stored, read_record
 from slviewer.records.merge import Merge
@@ -211,7 +212,7 @@ def test_scans_are_aligned_as_they_come_and_merged_from_there(operator: Operator
         assert T is not None and 0.003 < (placed[name].rms_mm or 0) < 0.3
         D = np.array(T) @ np.linalg.inv(truth(name))
         assert 1e-5 < np.linalg.norm(D[:3, :3] @ MIDDLE + D[:3, 3] - MIDDLE) < 0.3
-    together = result_views.aligned_scans(store)
+    together = view_places(load_placements(store), {}, store)
     assert together.names == ("first", "second", "third") and 0.6 < together.share_seen_again < 1
     assert 1 == together.seen_by.min() < together.seen_by.max() == 3
 

@@ -13,8 +13,8 @@ from slviewer.calibration.next_pose import count_coverage, describe_suggestion, 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.rig import StereoRig
 from slviewer.target.board import Board
-from slviewer.wizard.planner import Planner
-from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
+from slviewer.wizard import pose_plan
+from slviewer.wizard.pose_plan import PlanInput, Planner, PoseFeatures, PosePlan
 
 BOARD = Board.parse("circles:15x12:12")
 SIZE = (400, 300)
@@ -55,7 +55,7 @@ class Plans:
         self.final, self.quick = plan_of(()), plan_of(())
         self.before: list[PosePlan | None] = []
 
-    def compute(self, given: PlanInput) -> PosePlan:
+    def compute(self, given: PlanInput, trials: int) -> PosePlan:
         self.begun.append(given)
         self.has_begun.set()
         assert self.may_end.wait(HANG_S)
@@ -67,8 +67,11 @@ class Plans:
 
 
 @pytest.fixture
-def plans() -> Plans:
-    return Plans()
+def plans(monkeypatch: pytest.MonkeyPatch) -> Plans:
+    plans = Plans()
+    monkeypatch.setattr(pose_plan, "plan_next_pose", plans.compute)
+    monkeypatch.setattr(pose_plan, "quick_plan", plans.compute_quickly)
+    return plans
 
 
 @pytest.fixture
@@ -78,7 +81,7 @@ def changes() -> threading.Semaphore:
 
 @pytest.fixture
 def planner(changes: threading.Semaphore, plans: Plans) -> Iterator[Planner]:
-    planner = Planner(changes.release, plans.compute, plans.compute_quickly)
+    planner = Planner(changes.release)
     yield planner
     plans.may_end.set()
     planner.close()
@@ -139,12 +142,16 @@ def test_only_the_latest_request_is_computed(
 
 
 def test_where_computing_fails_the_quick_plan_remains(
-    plans: Plans, changes: threading.Semaphore, caplog: pytest.LogCaptureFixture
+    plans: Plans,
+    changes: threading.Semaphore,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def fail(given: PlanInput) -> PosePlan:
+    def fail(given: PlanInput, trials: int) -> PosePlan:
         raise np.linalg.LinAlgError("singular")
 
-    planner = Planner(changes.release, fail, plans.compute_quickly)
+    monkeypatch.setattr(pose_plan, "plan_next_pose", fail)
+    planner = Planner(changes.release)
     quick = planner.look_up(given("a"))
     planner.request(given("a"))
     assert changes.acquire(timeout=HANG_S)

@@ -23,6 +23,7 @@ from slviewer.wizard.preview_watcher import (
     brightness,
     reduced,
 )
+from slviewer.wizard.service import Timing
 from slviewer.wizard.snapshot import BoardSeen, PreviewView
 
 BOARD = Board.parse("circles:9x7:20")
@@ -145,7 +146,7 @@ def test_stillness_starts_anew_with_every_movement() -> None:
 
 
 def test_hands_free_counts_down_once_a_place() -> None:
-    hands_free = HandsFree()
+    hands_free = HandsFree(Timing())
     assert hands_free.countdown(seen(7), False, 0) is None
     hands_free.is_on = True
     assert (

@@ -130,7 +130,7 @@ def test_several_exposures_follow_the_one_that_they_were_chosen_by(operator: Ope
 def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operator) -> None:
     session = operator.session
     assert session is not None and operator.set_exposure(2.0)
-    assert operator._set_preflight(operator._bench, Preflight((), 37.0, None, None, 1.0))
+    operator._set_preflight(Preflight((), 37.0, None, None, 1.0))
     assert operator.choose_rig(RIG)
     assert (
         session.decision("rig") == {**RIG, "settle_ms": 37.0}

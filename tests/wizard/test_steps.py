@@ -12,8 +12,15 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture import Space
 from slviewer.target.board import Board
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
-from slviewer.wizard.snapshot import CalibrationView, PoseView, RigView, SessionView
-from slviewer.wizard.steps import Facts, views
+from slviewer.wizard.snapshot import (
+    Brightness,
+    CalibrationView,
+    PoseView,
+    RigView,
+    SessionView,
+    Snapshot,
+)
+from slviewer.wizard.steps import views
 
 OPEN = RigView(state="open", name="bench", camera=(400, 300), projector=(912, 1140))
 EMPTY = SessionView(Path("s"), "", "complementary")
@@ -30,9 +37,7 @@ def planned(covered: bool, sigma_mm: float | None = None) -> PosePlan:
 
 
 def poses(n: int, state="good", why: str = "") -> tuple[PoseView, ...]:
-    return tuple(
-        PoseView(f"pose_{i}", state, why, "", None, False, None, None, b"") for i in range(n)
-    )
+    return tuple(PoseView(f"pose_{i}", state, why, "", None, None, None, b"") for i in range(n))
 
 
 def calibration(stale: str = "") -> CalibrationView:
@@ -44,7 +49,16 @@ def calibration(stale: str = "") -> CalibrationView:
     return CalibrationView(stereo, ("stereo",), "stereo", stale)
 
 
-def states(facts: Facts) -> dict[str, str]:
+def seen(
+    session: SessionView | None,
+    rig: RigView,
+    space: Space | None = None,
+    brightness: Brightness = "",
+) -> Snapshot:
+    return Snapshot(session=session, rig=rig, space=space, brightness=brightness)
+
+
+def states(facts: Snapshot) -> dict[str, str]:
     return {view.key: view.state for view in views(facts)}
 
 
@@ -52,41 +66,41 @@ def test_the_way_through_the_wizard() -> None:
     blocked = dict.fromkeys(
         ("calibrate", "verify", "scan", "merge", "measure", "export"), "blocked"
     )
-    assert states(Facts(None, RigView(), None)) == {
+    assert states(seen(None, RigView(), None)) == {
         "rig": "ready",
         "target": "blocked",
         "poses": "blocked",
         **blocked,
     }
-    assert states(Facts(EMPTY, OPEN, None)) == {
+    assert states(seen(EMPTY, OPEN, None)) == {
         "rig": "done",
         "target": "ready",
         "poses": "blocked",
         **blocked,
     }
     aimed = replace(EMPTY, target="circles:9x7:20")
-    assert states(Facts(aimed, OPEN, None)) == {
+    assert states(seen(aimed, OPEN, None)) == {
         "rig": "done",
         "target": "done",
         "poses": "ready",
         **blocked,
     }
     few = replace(aimed, poses=poses(2))
-    blocked_by = next(v for v in views(Facts(few, OPEN, None)) if v.key == "calibrate").blocked_by
+    blocked_by = next(v for v in views(seen(few, OPEN, None)) if v.key == "calibrate").blocked_by
     assert missing_facts(blocked_by, 2, MIN_POSES) == []
     enough = replace(aimed, poses=poses(10), plan=planned(True))
-    reached = states(Facts(enough, OPEN, None))
+    reached = states(seen(enough, OPEN, None))
     assert (reached["poses"], reached["calibrate"], reached["verify"]) == (
         "done",
         "ready",
         "blocked",
     )
-    done = states(Facts(replace(enough, calibration=calibration()), OPEN, None))
+    done = states(seen(replace(enough, calibration=calibration()), OPEN, None))
     assert (
         done["calibrate"] == "done" and done["verify"] == done["scan"] == done["export"] == "ready"
     )
     assert done["merge"] == done["measure"] == "blocked"
-    stale = Facts(
+    stale = seen(
         replace(enough, calibration=calibration("pose_1 was excluded since: calibrate again")),
         OPEN,
         None,
@@ -102,7 +116,7 @@ def test_the_way_through_the_wizard() -> None:
 
 def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:
     rejected = replace(calibration(), rejected="pose_3 moved by 0.9 px: take the pose again")
-    facts = Facts(
+    facts = seen(
         replace(EMPTY, target="circles:9x7:20", poses=poses(10), calibration=rejected), OPEN, None
     )
     found = {view.key: view for view in views(facts)}
@@ -122,8 +136,8 @@ def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:
 
 def test_a_recorded_session_needs_no_rig() -> None:
     recorded = replace(EMPTY, target="circles:9x7:20", poses=poses(9))
-    assert states(Facts(recorded, RigView(), None))["poses"] == "done"
-    assert states(Facts(recorded, RigView(), None))["calibrate"] == "ready"
+    assert states(seen(recorded, RigView(), None))["poses"] == "done"
+    assert states(seen(recorded, RigView(), None))["calibrate"] == "ready"
 
 
 def test_every_step_says_in_one_sentence_what_to_do_and_what_is_wrong() -> None:
@@ -131,7 +145,7 @@ def test_every_step_says_in_one_sentence_what_to_do_and_what_is_wrong() -> None:
         EMPTY, target="t", poses=poses(4, "refused", "12 of 336 circles found: lower the exposure")
     )
     lost = replace(OPEN, state="lost", fault="the camera is gone: plug it in")
-    facts = Facts(session, lost, Space(1_000_000, 10_000_000), "saturated")
+    facts = seen(session, lost, Space(1_000_000, 10_000_000), "saturated")
     for view in views(facts):
         assert (
             view.instruction
@@ -146,18 +160,18 @@ def test_every_step_says_in_one_sentence_what_to_do_and_what_is_wrong() -> None:
 
 def test_poses_that_cover_the_view_may_still_lack_accuracy() -> None:
     covering = replace(EMPTY, target="circles:9x7:20", poses=poses(10), plan=planned(True))
-    assert missing_facts(views(Facts(covering, OPEN, None))[2].instruction, 10, "calibrate") == []
+    assert missing_facts(views(seen(covering, OPEN, None))[2].instruction, 10, "calibrate") == []
     lacking = replace(covering, plan=planned(True, 0.03), wanted_mm=0.024)
     assert (
         missing_facts(
-            views(Facts(lacking, OPEN, None))[2].instruction, "0.030 mm", "0.024 mm", "add more"
+            views(seen(lacking, OPEN, None))[2].instruction, "0.030 mm", "0.024 mm", "add more"
         )
         == []
     )
     enough = replace(lacking, wanted_mm=0.031)
-    instruction = views(Facts(enough, OPEN, None))[2].instruction
+    instruction = views(seen(enough, OPEN, None))[2].instruction
     assert enough.enough and missing_facts(instruction, "0.030 mm", "0.031 mm", "calibrate") == []
     assert missing_facts(instruction, "add more") == ["add more"]
     pending = PlanInput(Board.parse("circles:9x7:20"), (400, 300), (912, 1140), {})
     few = replace(lacking, poses=poses(3), plan=planned(False), pending_plan=pending)
-    assert missing_facts(views(Facts(few, OPEN, None))[2].instruction, "computing", "pose 4") == []
+    assert missing_facts(views(seen(few, OPEN, None))[2].instruction, "computing", "pose 4") == []

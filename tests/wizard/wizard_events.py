@@ -6,8 +6,8 @@ from collections.abc import Callable
 import clocks
 from clocks import HANG_S
 
-from slviewer.wizard.engine import Timing
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.service import Timing
 from slviewer.wizard.snapshot import Level, Snapshot
 
 SPARING = Timing(retry_s=0.1, previews_per_s=1.0, trials=20)

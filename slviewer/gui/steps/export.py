@@ -133,7 +133,9 @@ class ExportPanel(StepPanel):
         with gui.add_folder("Figures", expand_by_default=False) as self._figures_folder:
             self._figures = Text(gui)
         with gui.add_folder("Report and tables"):
-            self._report = self.button("Write report", operator.report, "report", None)
+            self._report = self.button(
+                "Write report", lambda: operator.export("report"), "report", None
+            )
             self._table = self.button(
                 "Write figures",
                 lambda: operator.export("table"),

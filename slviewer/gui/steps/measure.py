@@ -21,8 +21,8 @@ from slviewer.records.measurement import Measurement
 from slviewer.report.canvas import round_up
 from slviewer.session.nominal import MM, Units
 from slviewer.surface.selection import ViewCamera
+from slviewer.wizard.result_views import box_in_view, place_at, point_at
 from slviewer.wizard.snapshot import SessionView
-from slviewer.wizard.surfaces import box_in_view, place_at, point_at
 
 COLOURS = ("texture", "depth", "uncertainty")
 DEVIATION = "deviation"

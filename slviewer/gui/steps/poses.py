@@ -283,7 +283,7 @@ class PosesPanel(StepPanel):
             rms = f"Reprojection RMS: camera {camera:.3f} px, projector {projector:.3f} px"
             lines.append(to_html(rms))
         if pose.T_camera_board is not None:
-            about = "" if pose.calibrated else "about "
+            about = "" if pose.state == "used" else "about "
             lines.append(coloured(f"Distance {about}{pose.T_camera_board[2, 3]:.0f} mm", "dim"))
         picture = thumbnail(pose.thumbnail, 150, pose.name)
         text = "".join(f"<div>{line}</div>" for line in lines)

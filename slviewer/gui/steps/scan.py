@@ -30,16 +30,11 @@ from slviewer.gui.widgets import (
     thumbnail,
     to_html,
 )
+from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
 from slviewer.records.verification import Verification
 from slviewer.report.maps import error_limit
 from slviewer.simulation.concave import CONCAVE
-from slviewer.wizard.result_views import (
-    AlignedScans,
-    ScanCloud,
-    aligned_scans,
-    used_points,
-    whole_cloud,
-)
+from slviewer.wizard.result_views import ScanCloud, used_points, whole_cloud
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView
 
 SMALL_PX = 380
@@ -247,11 +242,11 @@ class ScanPanel(StepPanel):
         if self._is_live:
             return
         if self._view.value == ALIGNED:
-            placed = [each for each in self.session.scans if each.is_placed]
+            placed, store = [s for s in self.session.scans if s.is_placed], self.context.session
             self.painter.request(
                 self._draw_aligned,
                 tuple((each.name, each.figures.model) for each in placed),
-                lambda: aligned_scans(self.context.session),
+                lambda: view_places(load_placements(store), {}, store),
             )
             self.painter.cancel(self._draw_cloud)
         elif is_absent:
