@@ -288,7 +288,7 @@ class Painter:
         self._requested.pop(show, None)
 
 
-class View:
+class ControlGroup:
     """Base of what is built of inputs: each calls back one after the other, reports what is raised,
     and is followed by `redraw`."""
 
@@ -417,7 +417,7 @@ class View:
         return Setting(self.context, handle, request)
 
 
-class StepPanel(View):
+class StepPanel(ControlGroup):
     """Base of the steps' panels, each with a layer of the scene that is shown with it. Every method
     is called by one thread at a time."""
 
@@ -496,7 +496,7 @@ class StepPanel(View):
         self.layer.show(visible)
 
 
-class PanelPart(View):
+class PanelPart(ControlGroup):
     """Base of what several panels share, and of parts that have a state of their own; drawn before
     its panel, by whose painter and in whose layer."""
 

@@ -17,7 +17,7 @@ import viser
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.evaluation.render import format_count
-from slviewer.gui.panel import NO_SESSION, PanelContext, StepPanel, View
+from slviewer.gui.panel import NO_SESSION, ControlGroup, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.widgets import (
     NOTICES,
@@ -70,7 +70,7 @@ _MOST_NOTICES = 12  # of the latest, in the panel
 _MOST_FAULTS = 3  # of the session's files, in the panel
 
 
-class Shell(View):
+class Shell(ControlGroup):
     """The page: builds it once; `update` and `draw_preview` update it, from one thread."""
 
     def __init__(self, context: PanelContext, steps: Sequence[StepView]) -> None:

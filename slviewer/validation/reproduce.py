@@ -26,17 +26,15 @@ from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
 from slviewer.records.plain import to_plain
-from slviewer.records.table import render_text
-from slviewer.records.verification import Shape, Verification, centre_distances_mm
+from slviewer.records.table import Row, Table, render_text
+from slviewer.records.verification import Shape, Verification, average, centre_distances_mm
 from slviewer.report.page import write_page
 from slviewer.report.reproduction import (
     ReproductionData,
     inside_ratio,
-    radius_table,
     reproduction_headlines,
     reproduction_sections,
     reproduction_title,
-    shape_table,
 )
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
@@ -119,12 +117,11 @@ class Reproduction:
                 ),
                 "",
                 "Flat board (Table 1)",
-                render_text(shape_table(planes, "")),
+                _render_shapes(planes),
                 f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
                 "",
                 f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
-                render_text(shape_table(spheres, "")),
-                render_text(radius_table(spheres, "")),
+                _render_shapes(spheres),
                 "Distances between the sphere centres, RMS error: "
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",
@@ -276,6 +273,34 @@ def _make_report_data(
         clouds={name: cloud.points for name, cloud in merged.clouds.items()},
         fused=merged.fused,
     )
+
+
+def _render_shapes(found: Mapping[str, Verification]) -> str:
+    """The table of planes or spheres for the terminal: a line for each capture and one of means,
+    with the Letter's figures beside ours."""
+    shape = next(iter(found.values())).shape
+    theirs = {name: letter.find_pose(name, shape) for name in found}
+    rows = [_make_row(name, each, theirs[name]) for name, each in found.items()]
+    ours, letters = (average(shape, each.values()) for each in (found, theirs))
+    mean = _make_row("mean", ours, letters)
+    mean |= {title: mm for title, mm in letter.MEANS_MM.items() if title in mean}
+    return render_text(Table.of(rows, footer=[mean]))
+
+
+def _make_row(name: str, ours: Verification, theirs: Verification) -> Row:
+    """The figures of one capture by each model, and the Letter's."""
+    shares = (f"{share:.1f}".removesuffix(".0") for share in (ours.incidence or {}).values())
+    row: Row = {"capture": name, "R1/R2/R3 %": "/".join(shares) or None}
+    for model, fit in ours.models.items():
+        row |= {f"{model} mm": fit.rms_mm, f"{model} floor": fit.noise_floor_mm}
+        if fit.radius_mm is not None:
+            row[f"{model} radius"] = fit.radius_mm
+    first, second = MODELS[:2]
+    row["ratio"] = ours.rms_mm[first] / ours.rms_mm[second]
+    row |= {f"Letter {model}": mm for model, mm in theirs.rms_mm.items()}
+    if theirs.models:
+        row["Letter ratio"] = theirs.rms_mm[first] / theirs.rms_mm[second]
+    return row | {f"Letter {model} radius": mm for model, mm in theirs.radii_mm.items()}
 
 
 def _list_records(comparisons: Mapping[str, Comparison]) -> dict[str, Verification]:
