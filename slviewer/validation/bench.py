@@ -17,6 +17,7 @@ from slviewer.calibration.splined.compiled import DEPTHS, GRID_CELLS_ACROSS, Com
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import Row, render
+from slviewer.examination.examine import examine
 from slviewer.fringe import kernels_coded, kernels_levels
 from slviewer.fringe.decode import code_rules, decode, grey_scale, pack_levels, pack_shifts
 from slviewer.fringe.layout import axis_layout
@@ -130,7 +131,12 @@ def bench(
     stage = f"decode {len(frames) - 1} frames"
     note = "phase, wrapped phase, modulation, background and reason, in arrays made before"
     decoding, kernel = _time_decoding(stage, sequence, frames, note, defined)
-    rows += [*decoding, row(f"{stage}, NumPy definition", defined)]
+    examining = median(lambda: examine(sequence, frames), 5)
+    rows += [
+        *decoding,
+        row(f"{stage}, NumPy definition", defined),
+        row(f"examine {len(frames)} frames", examining, target=0.04),
+    ]
     progress(0.2, "measuring")
     rows += _time_measuring(sequence, frames)
     progress(0.3, "live")
