@@ -147,7 +147,7 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
         else:
             devices = {
                 part: _make_device(part, choice[part], page=pages and getattr(pages, part))
-                for part in PAGE_ROLES
+                for part in ("camera", "projector")
             }
             made = Rig(str(choice.get("name", "rig")), **devices)
         if isinstance(made, Reel):
