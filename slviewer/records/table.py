@@ -64,13 +64,14 @@ class Column:
 @dataclass(frozen=True)
 class Table:
     """Rows of values or cells under columns; ``footer`` rows (means) stand apart below, then
-    ``notes``."""
+    ``notes``. ``repeats``: names that repeat the one above are shown."""
 
     columns: Sequence[Column]
     rows: Sequence[Sequence[Value | Cell]]
     caption: str
     notes: Sequence[str] = ()
     footer: Sequence[Sequence[Value | Cell]] = ()
+    repeats: bool = False
 
     def __post_init__(self) -> None:
         for row in (*self.rows, *self.footer):
@@ -134,7 +135,7 @@ class Table:
         self, rows: Sequence[Sequence[Value | Cell]]
     ) -> list[list[tuple[Column, str, Mark]]]:
         """Return column, text and mark of each cell of some rows; a name that repeats the one above
-        it is blank."""
+        it is blank, unless ``repeats``."""
         lines: list[list[tuple[Column, str, Mark]]] = []
         above = ""
         for row in rows:
@@ -142,7 +143,7 @@ class Table:
                 (column, *_format_cell(column, cell))
                 for column, cell in zip(self.columns, row, strict=True)
             ]
-            if line and line[0][0].align == "left":
+            if line and line[0][0].align == "left" and not self.repeats:
                 name = line[0][1]
                 line[0] = (line[0][0], "" if name == above else name, line[0][2])
                 above = name
