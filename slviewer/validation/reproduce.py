@@ -26,7 +26,7 @@ from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
 from slviewer.records.plain import to_plain
-from slviewer.records.table import Row, Table, render_text
+from slviewer.records.table import Column, Row, Table, render_text
 from slviewer.records.verification import Shape, Verification, average, centre_distances_mm
 from slviewer.report.page import write_page
 from slviewer.report.reproduction import (
@@ -290,7 +290,7 @@ def _render_shapes(found: Mapping[str, Verification]) -> str:
 def _make_row(name: str, ours: Verification, theirs: Verification) -> Row:
     """The figures of one capture by each model, and the Letter's."""
     shares = (f"{share:.1f}".removesuffix(".0") for share in (ours.incidence or {}).values())
-    row: Row = {"capture": name, "R1/R2/R3 %": "/".join(shares) or None}
+    row: Row = {"capture": name, Column("R1/R2/R3 %", align="right"): "/".join(shares) or None}
     for model, fit in ours.models.items():
         row |= {f"{model} mm": fit.rms_mm, f"{model} floor": fit.noise_floor_mm}
         if fit.radius_mm is not None:
