@@ -71,8 +71,10 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
             continue
         light = _fit(fitted, base, terms, gains if "gain" in terms else constant)
         gains = light if terms == ("gain",) else gains
-        own = _score(judged, base, light, first)
+        if len(terms) > 1 and not _is_large(base.sequence, light, "gain"):
+            light = replace(light, gain=constant.gain, terms=terms[1:])
         is_large = _is_large(base.sequence, light, terms[-1])
+        own = _score(judged, base, light, first)
         if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
     return _accept(base.sequence, stack, best, score) if best.terms else constant

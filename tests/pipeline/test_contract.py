@@ -121,7 +121,7 @@ OPERATIONS = {
     ),
     "validate": Operation(
         ("validate", "SESSION", "--models", "stereo"),
-        lambda session: operations.validate.validate(session, ["stereo"]),
+        lambda session: operations.accept.validate(session, ["stereo"]),
         lambda operator: operator.run("validate", models=["stereo"]),
         ("validation/1",),
         "pose_03",
