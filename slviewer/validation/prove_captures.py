@@ -43,7 +43,7 @@ Outcome = Literal["right", "harmless", "wrong", "HARMFUL", "LOST", "CRASH", "sou
 OF_FAULTS: tuple[Outcome, ...] = ("right", "harmless", "wrong", "HARMFUL", "LOST", "CRASH")
 OF_SOUND: tuple[Outcome, ...] = ("sound", "FALSE ALARM", "CRASH")
 PASSED: tuple[Outcome, ...] = ("right", "harmless", "sound")
-LEAST_NAMED, MOST_HARMFUL, MOST_ALARMS = 0.9, 0.04, 0.01
+LEAST_NAMED, MOST_HARMFUL, MOST_ALARMS = 0.95, 0.01, 0.01
 """Share of faults that are named or harmless; of those that are neither noticed nor harmless; and
 of sound captures with an alarm."""
 
