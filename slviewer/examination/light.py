@@ -398,7 +398,7 @@ def _fit(
     evaluator: Evaluator, base: Hypothesis, terms: tuple[Term, ...], start: FrameLight
 ) -> FrameLight:
     """Fit the terms of a model by Gauss-Newton steps from a first light, and return the light of
-    the step that leaves the least residual: of few fringes in view the steps may diverge."""
+    the last step that leaves about the least residual: of few fringes in view they may diverge."""
     light = best = replace(start, terms=terms)
     least = np.inf
     for step in range(limits.MOST_STEPS):
@@ -410,8 +410,8 @@ def _fit(
             break
         normal = _accumulate(parts, light, terms)
         left = normal.loss * (1 - normal.solve(())[1])
-        if left < least:
-            least, best = left, light
+        if left < limits.NO_WORSE * least:
+            least, best = min(left, least), light
         if "room" in terms and not step:
             rated = normal.rate_changes(terms)
             if not rated:

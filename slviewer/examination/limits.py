@@ -127,6 +127,9 @@ LEAST_GHOST, GHOST_SIGMAS = 0.02, 5.0
 LIGHT_SHARE = 0.008
 """Share of the residual, beyond that of as many values of noise, that one step of a term of the
 light must explain for it to be estimated: measured, light that is corrected explains 0.014."""
+NO_WORSE = 1.1
+"""Factor of the least residual of all steps that the last one may leave: the pixels' weights change
+from step to step."""
 BETTER_LIGHT, EXPLAINED_WELL = (0.9, 0.75), 0.05
 """Share of the residual that one term of the light, and a second one, may leave; and the share that
 a single term leaves where no second one is tried."""
