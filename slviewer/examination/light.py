@@ -262,9 +262,7 @@ class _Normal:
         contrast and level imitate, and 0 where the sample does not determine them. ``change``:
         frame before which the room's light changes.
         """
-        t, deviations, _ = self._design(terms, (change,))
-        moment = t.T @ self.moment
-        normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
+        t, normal, moment, _ = self._reduce(terms, (change,))
         x = np.linalg.solve(normal, moment)
         n = len(self.groups)
         step = (t @ x).reshape(len(self.values), n)
@@ -289,9 +287,7 @@ class _Normal:
             for i in range(few, len(known) - few + 1)
             if not {*groups[:i]}.isdisjoint(groups[i:])
         ]
-        t, deviations, changes = self._design(terms, inner)
-        moment = t.T @ self.moment
-        normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
+        _, normal, moment, changes = self._reduce(terms, inner)
         out = dict[int, float]()
         for k in inner:
             own = np.flatnonzero((changes == k) | (changes < 0))
@@ -299,11 +295,12 @@ class _Normal:
             out[k] = float(x @ moment[own]) / max(self.entries, 1)
         return out
 
-    def _design(
+    def _reduce(
         self, terms: Sequence[Term], changes: Sequence[int]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what q unknowns do to the values (v n, q), the standard deviation (q,) of each
-        before, and the frame before which the room's light changes (q,), -1 of other unknowns."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return what q unknowns do to the values (v n, q), their normal equations (q, q) and (q,)
+        with what is known of them before, and the frame before which the room's light changes (q,),
+        -1 of other unknowns."""
         n = len(self.groups)
         each, other = np.eye(n), self.groups < 0
         periods = [(self.groups == g).astype(float) for g in range(self.groups.max() + 1)]
@@ -329,7 +326,8 @@ class _Normal:
                 blur = np.where(self.fuzzy[other] < limits.FUZZY, *limits.CONTRAST_PRIORS)
                 deviations[own][len(periods) :] = blur
             of_room += changes if name in VALUES["room"] else [-1] * blocks[name].shape[1]
-        return t, deviations, np.array(of_room)
+        normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
+        return t, normal, t.T @ self.moment, np.array(of_room)
 
 
 def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[Term]) -> _Normal:

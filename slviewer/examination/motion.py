@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,19 +21,17 @@ def measure_motion(evaluator: Evaluator, base: Hypothesis) -> dict[Axis, float]:
     out = dict[Axis, float]()
     for axis, steps in _measure_steps(evaluator, base):
         period, every = base.sequence.periods_px(axis)[-1], np.arange(len(steps.shift))
-        steady = _fit_shape(steps, every / len(every))
-        if _is_clear(steady, limits.SIGMAS, period):
-            out[axis] = steady[0]
-        jumps = [(*_fit_shape(steps, every >= k), k) for k in every[1:]]
-        jump = max(jumps, key=lambda fitted: fitted[2])
-        displaced = every >= jump[3]
+        steady = steps.fit(every / len(every))
+        if steady.is_clear(limits.SIGMAS, period):
+            out[axis] = steady.px
+        jump = max((steps.fit(every >= k) for k in every[1:]), key=lambda fitted: fitted.share)
+        displaced = jump.shape
         if steps.weight[displaced].sum() > steps.weight.sum() / 2:
             displaced = ~displaced
-        is_jump = jump[2] > max(limits.JUMP_SHARE, steady[2])
-        is_jump &= abs(jump[0]) < limits.MOST_JUMP * period
-        is_jump &= steps.explains(displaced)
-        if is_jump and _is_clear(jump[:3], limits.JUMP_SIGMAS, period):
-            out[axis] = jump[0]
+        is_jump = jump.share > max(limits.JUMP_SHARE, steady.share)
+        is_jump &= abs(jump.px) < limits.MOST_JUMP * period
+        if is_jump and steps.explains(displaced) and jump.is_clear(limits.JUMP_SIGMAS, period):
+            out[axis] = jump.px
     return out
 
 
@@ -42,6 +41,20 @@ def is_displaced(evaluator: Evaluator, base: Hypothesis, image: int) -> bool:
         image in steps.images and steps.explains(steps.images == image)
         for _, steps in _measure_steps(evaluator, base)
     )
+
+
+class _Displacement(NamedTuple):
+    """Multiple ``px`` of a ``shape`` (k,) that fits the displacements of k steps, its standard
+    error, and the share of their weighted variance that it explains."""
+
+    shape: np.ndarray
+    px: float
+    error: float
+    share: float
+
+    def is_clear(self, sigmas: float, period_px: float) -> bool:
+        """Return whether it is larger than gamma and noise imitate."""
+        return abs(self.px) > limits.LEAST_MOTION * period_px + sigmas * self.error
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +70,15 @@ class _Steps:
     weight: np.ndarray
     explained: np.ndarray
     whole: np.ndarray
+
+    def fit(self, shape: np.ndarray) -> _Displacement:
+        """Fit the displacements by a multiple of a shape (k,) and a constant."""
+        centred = shape - np.average(shape, weights=self.weight)
+        information = float(self.weight @ centred**2)
+        px = float((self.weight * centred) @ self.shift) / information
+        shift = self.shift - np.average(self.shift, weights=self.weight)
+        variance = float(self.weight @ shift**2)
+        return _Displacement(shape, px, information**-0.5, px**2 * information / variance)
 
     def explains(self, steps: np.ndarray) -> bool:
         """Return whether displacement explains most of what some steps, (k,) bool, leave."""
@@ -85,20 +107,3 @@ def _measure_steps(evaluator: Evaluator, base: Hypothesis) -> Iterator[tuple[Axi
         )
         weight = squares / whole * residual.shape[1]
         yield axis, _Steps(images[order], -moment / squares, weight, moment**2 / squares, whole)
-
-
-def _fit_shape(steps: _Steps, shape: np.ndarray) -> tuple[float, float, float]:
-    """Fit displacements by a multiple of a shape (k,) and a constant: the multiple, its standard
-    error, and the share of the displacements' weighted variance that it explains."""
-    weight = steps.weight
-    centred = shape - np.average(shape, weights=weight)
-    information = float(weight @ centred**2)
-    multiple = float((weight * centred) @ steps.shift) / information
-    variance = float(weight @ (steps.shift - np.average(steps.shift, weights=weight)) ** 2)
-    return multiple, information**-0.5, multiple**2 * information / variance
-
-
-def _is_clear(fitted: tuple[float, float, float], sigmas: float, period_px: float) -> bool:
-    """Return whether a displacement is larger than gamma and noise imitate."""
-    px, error, _ = fitted
-    return abs(px) > limits.LEAST_MOTION * period_px + sigmas * error

@@ -193,11 +193,11 @@ def fit_feature(
         )
     if kind == "point":
         raise InputError("A point is picked, not fitted: fit a plane, a sphere or a cylinder.")
-    looked_at = subsample(points, MAX_FITTED_POINTS)
+    sampled = subsample(points, MAX_FITTED_POINTS)
     try:
-        feature, inliers = _fit_robustly(kind, looked_at)
+        feature, inliers = _fit_robustly(kind, sampled)
     except InputError as error:
-        raise _describe_alternative(kind, looked_at, error) from error
+        raise _describe_alternative(kind, sampled, error) from error
     residuals = feature.distance(points)
     counted = within_sigmas(residuals, points)
     used = int(np.count_nonzero(counted))
@@ -207,7 +207,7 @@ def fit_feature(
             f"{100 * excluded_share:.0f} % of the region lies off the best {kind}: "
             "select a region that shows nothing else."
         )
-    basis = looked_at[inliers]
+    basis = sampled[inliers]
     _refuse_other(kind, feature, basis)
     spread = _estimate_spread(feature, basis, shared, calibration)
     sigma = spread.sigmas[-1]
