@@ -13,6 +13,7 @@ from slviewer.validation.prove_guidance import prove_guidance
 from slviewer.validation.prove_hostile import prove_hostile
 from slviewer.validation.prove_plan import prove_plan
 from slviewer.validation.prove_registration import prove_registration
+from slviewer.validation.prove_reports import prove_reports
 from slviewer.validation.prove_surfaces import prove_edges, prove_surfaces
 
 Claim = Literal[
@@ -23,6 +24,7 @@ Claim = Literal[
     "hostile",
     "plan",
     "registration",
+    "reports",
     "surfaces",
     "uncertainty",
 ]
@@ -50,6 +52,7 @@ CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "hostile": ("captures of a hostile rig", prove_hostile),
     "plan": ("tolerances of an inspection plan", prove_plan),
     "registration": ("scans in one frame", prove_registration),
+    "reports": ("reported situations", prove_reports),
     "surfaces": ("surfaces that light themselves", prove_surfaces),
     "uncertainty": ("predicted uncertainty", prove_uncertainty),
 }
@@ -102,8 +105,8 @@ def prove(
         quick: A quarter of the camera's resolution; its figures are its own.
         only: What to prove: accuracy on planes and spheres, causes of bad calibrations and
             captures, printed edges, guidance of an operator to good poses, captures of a hostile
-            rig, tolerances of an inspection plan, registration of scans, surfaces that light
-            themselves, uncertainty against true errors; by default all.
+            rig, tolerances of an inspection plan, registration of scans, reported situations,
+            surfaces that light themselves, uncertainty against true errors; by default all.
         cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or
             gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.

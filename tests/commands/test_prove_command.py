@@ -57,6 +57,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
         "hostile": True,
         "plan": True,
         "registration": True,
+        "reports": True,
         "surfaces": True,
         "uncertainty": True,
     }

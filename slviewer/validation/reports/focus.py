@@ -1,0 +1,5 @@
+"""A rig that changed after its calibration."""
+
+from slviewer.validation.reports.case import Case
+
+CASES: dict[str, Case] = {}

@@ -1,0 +1,19 @@
+"""Reported situations give the right value, or a refusal whose remedy leads to it."""
+
+from pathlib import Path
+
+import pytest
+
+from slviewer.validation.prove_reports import CASES, run_case
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("reports")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_report_gives_the_right_value_or_a_remedy_that_does(name: str, shared: Path) -> None:
+    outcome = run_case(name, shared)
+    assert outcome.holds, f"measured {outcome.measured}, true {outcome.truth}"
