@@ -25,35 +25,31 @@ from slviewer.examination.findings import (
     wrap,
 )
 from slviewer.examination.ghost import has_ghost
-from slviewer.examination.light import equalize_samples, estimate_light
+from slviewer.examination.light import Look, equalize_samples, look_at
 from slviewer.examination.motion import is_displaced, measure_motion
-from slviewer.examination.sample import sample_capture
 from slviewer.fringe.aliased_harmonics import MOST_STEPS, estimate_aliased_harmonics
 from slviewer.fringe.decoding_task import prepare_decoding
 from slviewer.fringe.frame_light import FrameLight
-from slviewer.fringe.layout import axis_layout, check_stack
+from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.levels import layout_levels
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.records.verdict import Examination, Finding
 
 
-def examine(
-    sequence: PatternSequence, stack: np.ndarray, light: FrameLight | None = None
-) -> Examination:
+def examine(sequence: PatternSequence, stack: np.ndarray, look: Look | None = None) -> Examination:
     """Examine the frames (n, h, w) uint8 or uint16 of a capture.
 
     Every hypothesis (an order of the images, another convention of the description) predicts the
     grey levels of sampled pixels from their neighbours; the one that explains all frames best is
-    named, and nothing where the description explains them as well. ``light``: estimated if None.
+    named, and nothing where the description explains them as well. ``look`` at them: taken if None.
     Raises InputError for a stack that does not match the sequence.
     """
-    check_stack(sequence, stack)
+    look = look or look_at(sequence, stack)
     if not sequence.axes:
         return Examination()
+    base, light = described(sequence), look.light
     with threadpool_limits(1, "blas"):  # the products of a sample are too small for more
-        evaluator, base = Evaluator(sample_capture(sequence, stack)), described(sequence)
-        light = light or estimate_light(evaluator, base, stack)
-        findings = _judge(stack, _correct(evaluator, base, light), base, light)
+        findings = _judge(stack, _correct(look.evaluator, base, light), base, light)
     return Examination(tuple(findings), light.drift)
 
 

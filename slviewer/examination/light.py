@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, Hypothesis, described
-from slviewer.examination.sample import Sample, sample_capture
+from slviewer.examination.sample import CaptureSample, Sample, sample_capture
 from slviewer.fringe.frame_light import FrameLight, Term, estimate_albedo, list_shifts
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -39,19 +39,35 @@ AROUND = np.linspace(-1, 1, 7)
 changed by blur."""
 
 
-def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameLight:
-    """Estimate the light of the frames (n, h, w) uint8 or uint16 of a capture, from all of them
-    together.
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One look at the frames ``stack`` (n, h, w) of a capture: the evaluator of the sample that was
+    taken of them, and the light of each frame. Decoding and examination share it."""
 
-    Frames that cannot be judged have gain 1. Raises InputError when the frames are not those of the
-    sequence.
+    stack: np.ndarray
+    evaluator: Evaluator
+    light: FrameLight
+
+
+def look_at(sequence: PatternSequence, stack: np.ndarray) -> Look:
+    """Look at the frames (n, h, w) uint8 or uint16 of a capture.
+
+    Frames whose light cannot be judged have gain 1. Raises InputError when the frames are not those
+    of the sequence.
     """
     check_stack(sequence, stack)
     if not sequence.axes:
-        return FrameLight.constant(len(stack))
+        nothing = Evaluator(CaptureSample({}, 0.0, 0.0, 0.0, 0.0, 0.0))
+        return Look(stack, nothing, FrameLight.constant(len(stack)))
     with threadpool_limits(1, "blas"):  # the products of a sample are too small for more
         evaluator = Evaluator(sample_capture(sequence, stack))
-        return estimate_light(evaluator, described(sequence), stack)
+        return Look(stack, evaluator, estimate_light(evaluator, described(sequence), stack))
+
+
+def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameLight:
+    """Estimate the light of the frames of a capture, from all of them together, as `look_at`
+    does."""
+    return look_at(sequence, stack).light
 
 
 def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) -> FrameLight:

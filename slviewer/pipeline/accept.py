@@ -37,7 +37,12 @@ from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.geometry.shapes import fit_plane
 from slviewer.geometry.vectors import finite_rows, rms, rms_length
 from slviewer.pipeline.calibrate import CalibrateSettings
-from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture
+from slviewer.pipeline.capture_phases import (
+    capture_texture,
+    check_capture,
+    decode_capture,
+    look_at_capture,
+)
 from slviewer.pipeline.feedback import Progress, part, stage
 from slviewer.pipeline.models import (
     MODELS,
@@ -249,8 +254,8 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     warn_if_stale(store, job.warn)
     shot = store.load_capture(capture)
     job.progress(0.0, f"reading {capture}")
-    frames = shot.stack()
-    phases = decode_capture(shot, frames)
+    look = look_at_capture(shot)
+    frames, phases = look.stack, decode_capture(shot, look)
     check_capture(capture, shot.sequence, frames, phases, files=shot.files)
     check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
     board = Board.parse(stereo.board)

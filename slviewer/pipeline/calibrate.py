@@ -18,6 +18,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, DetectionError, InputError, SessionError
+from slviewer.examination.light import look_at
 from slviewer.fringe.decode import texture
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
@@ -199,14 +200,15 @@ def calibrate_frames(
             DecodedPose(
                 name,
                 sequence,
-                frames,
-                decode_or_explain(name, sequence, frames),
-                convert_to_8bit(texture(sequence, frames)),
+                look,
+                decode_or_explain(name, sequence, look),
+                convert_to_8bit(texture(sequence, look.stack)),
                 board,
             ),
             settings.step_2,
         )
         for name, frames in poses.items()
+        for look in (look_at(sequence, frames),)
     )
     diagnosed = _diagnose_poses(judged, len(poses), sequence, board, {}, part(progress, 0, 0.65))
     result = _fit_models(diagnosed, settings, part(progress, 0.66, 1.0), warn)

@@ -11,7 +11,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.examination.findings import describe_disturbance
-from slviewer.examination.light import estimate_frame_light
+from slviewer.examination.light import Look, estimate_frame_light, look_at
 from slviewer.fringe.decode import decode, texture
 from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.hdr import radiance, toned
@@ -31,6 +31,7 @@ from slviewer.session.exporters import write_exr
 from slviewer.session.store import Session
 
 T = TypeVar("T")
+Computed = TypeVar("Computed")
 MANY_SATURATED = 0.05
 """Share of the illuminated pixels: highlights saturate fewer, an exposure that is too long more."""
 NEAR_DARK = 2.0
@@ -55,14 +56,15 @@ _FAULTS = {
 
 
 def decode_capture(
-    capture: Capture, frames: np.ndarray | None = None, *, relative: bool = False
+    capture: Capture, look: Look | None = None, *, relative: bool = False
 ) -> dict[Axis, PhaseMap]:
-    """Decode the absolute phase of every axis of a capture.
+    """Decode the absolute phase of every axis of a capture, by a ``look`` at its frames, taken here
+    if None.
 
     Raises InputError for a phase that is not absolute, unless a ``relative`` one will do.
     """
-    frames = capture.frames if frames is None else frames
-    phases = decode_or_explain(capture.name, capture.sequence, frames, capture.files)
+    look = look or look_at_capture(capture)
+    phases = decode_or_explain(capture.name, capture.sequence, look, capture.files)
     for axis, phase in phases.items():
         if phase.is_relative and not relative:
             raise InputError(
@@ -90,14 +92,14 @@ def decode_frames(
 
 
 def decode_or_explain(
-    name: str, sequence: PatternSequence, frames: np.ndarray, files: Sequence[str] = ()
+    name: str, sequence: PatternSequence, look: Look, files: Sequence[str] = ()
 ) -> dict[Axis, PhaseMap]:
     """Decode as `decode_frames` does; where that fails, raise InputError with what the examination
     of the frames rejects, if it does."""
     try:
-        return decode_frames(name, sequence, frames)
+        return decode_frames(name, sequence, look.stack, look.light)
     except InputError:
-        raise_rejected(name, examine_frames(sequence, frames, files))
+        raise_rejected(name, examine_frames(sequence, look.stack, files, look))
         raise
 
 
@@ -110,10 +112,10 @@ def decode_examined(
     examination rejects comes first, as it explains the others. ``files``: names of the frames'
     files.
     """
-    light = estimate_frame_light(sequence, frames)
-    examination = examine_frames(sequence, frames, files, light)
+    look = look_at(sequence, frames)
+    examination = examine_frames(sequence, frames, files, look)
     raise_rejected(name, examination)
-    phases = decode_frames(name, sequence, frames, light)
+    phases = decode_frames(name, sequence, frames, look.light)
     check_capture(name, sequence, frames, phases, examination)
     return phases
 
@@ -260,12 +262,12 @@ def decode_captures(
     have no saved comparison.
     """
     captures = [session.load_capture(name) for name in names]
-    for capture, reading in compute_ahead(Capture.stack, captures):
-        frames = reading.result()
-        phases = decode_capture(capture, frames, relative=relative)
+    for capture, looking in compute_ahead(look_at_capture, captures):
+        look = looking.result()
+        frames, phases = look.stack, decode_capture(capture, look, relative=relative)
         if warn is not ignore_warnings:
             compared = (
-                load_or_save_examination(session, capture, frames)
+                load_or_save_examination(session, capture, look)
                 if check
                 else load_examination(session, capture.name)
             )
@@ -275,9 +277,15 @@ def decode_captures(
         yield capture, frames, phases
 
 
+def look_at_capture(capture: Capture) -> Look:
+    """Read the frames of a capture, and look at them. Raises DamagedError where they are not what
+    was saved."""
+    return look_at(capture.sequence, capture.stack())
+
+
 def compute_ahead(
-    compute: Callable[[T], np.ndarray], items: Sequence[T]
-) -> Iterator[tuple[T, Future[np.ndarray]]]:
+    compute: Callable[[T], Computed], items: Sequence[T]
+) -> Iterator[tuple[T, Future[Computed]]]:
     """Yield items with what is computed of them, whose `result()` may raise; the next one's is
     computed while one is processed."""
     with ThreadPoolExecutor(1) as worker:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.examination.examine import examine
-from slviewer.fringe.frame_light import FrameLight
+from slviewer.examination.light import Look
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Examination
@@ -41,11 +41,11 @@ def examine_frames(
     sequence: PatternSequence,
     stack: np.ndarray,
     files: Sequence[str] = (),
-    light: FrameLight | None = None,
+    look: Look | None = None,
 ) -> Examination:
     """Examine the frames (n, h, w) of a capture; findings name their ``files``, see
-    `name_frames`. ``light`` of the frames is estimated if None."""
-    examination = examine(sequence, stack, light)
+    `name_frames`. ``look`` at the frames: taken if None."""
+    examination = examine(sequence, stack, look)
     named = [
         replace(finding, sentence=name_frames(finding.sentence, sequence, files))
         for finding in examination.findings
@@ -54,14 +54,14 @@ def examine_frames(
 
 
 def load_or_save_examination(
-    session: Session, capture: Capture, frames: np.ndarray | None = None
+    session: Session, capture: Capture, look: Look | None = None
 ) -> Examination:
-    """Return the saved examination of a capture; without one, examine its ``frames`` (n, h, w),
-    read here if None, and save the result in a writable session."""
+    """Return the saved examination of a capture; without one, examine its frames by a ``look`` at
+    them, taken here if None, and save the result in a writable session."""
     if (saved := load_examination(session, capture.name)) is not None:
         return saved
-    stack = capture.frames if frames is None else frames
-    examination = examine_frames(capture.sequence, stack, capture.files)
+    stack = look.stack if look else capture.frames
+    examination = examine_frames(capture.sequence, stack, capture.files, look)
     if session.is_writable:
         meta = {
             "inputs": {capture.name: capture.hash},

@@ -18,6 +18,7 @@ from slviewer.calibration.diagnosis.frames import (
 from slviewer.calibration.diagnosis.numbering import detect_grid_size
 from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing, observe, pitch_px
 from slviewer.errors import DamagedError, InputError
+from slviewer.examination.light import Look
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import (
@@ -25,6 +26,7 @@ from slviewer.pipeline.capture_phases import (
     check_capture,
     compute_ahead,
     decode_capture,
+    look_at_capture,
 )
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.records.plain import to_plain
@@ -40,12 +42,12 @@ EVIDENCE_VERSION = 6
 
 @dataclass(frozen=True, eq=False)
 class DecodedPose:
-    """The frames (n, h, w) of a target pose with what they were decoded to; ``texture`` (h, w) or
+    """A look at the frames of a target pose with what they were decoded to; ``texture`` (h, w) or
     (h, w, 3) uint8 shows the board."""
 
     name: str
     sequence: PatternSequence
-    frames: np.ndarray
+    look: Look
     phases: Mapping[Axis, PhaseMap]
     texture: np.ndarray
     board: Board
@@ -74,7 +76,7 @@ def read_pose(
     None). ``observed`` is called with the observation before the frames are checked, after which
     the pose may still be refused.
     """
-    name, sequence, frames, phases = pose.name, pose.sequence, pose.frames, pose.phases
+    name, sequence, frames, phases = pose.name, pose.sequence, pose.look.stack, pose.phases
     detection: Detection | None = None
     observation: Observation | None = None
     refused = ""
@@ -85,7 +87,11 @@ def read_pose(
             observed(observation)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
-    checked = (examined or partial(examine_frames, sequence, frames))() if examine else None
+    checked = (
+        (examined or partial(examine_frames, sequence, frames, look=pose.look))()
+        if examine
+        else None
+    )
     if observation is not None:
         try:
             check_capture(name, sequence, frames, phases, checked)
@@ -100,16 +106,16 @@ def read_pose(
 def read_stored_pose(
     store: Session,
     capture: Capture,
-    frames: np.ndarray,
+    look: Look,
     board: Board,
     smoothing: Smoothing,
     observed: Callable[[Observation], None] | None,
 ) -> Judged:
-    """Decode the frames (n, h, w) of a pose, read it as ``read_pose`` does, and save the result and
+    """Decode the frames of a pose, read it as ``read_pose`` does, and save the result and
     the check of the frames in the session."""
-    phases, texture = decode_capture(capture, frames), capture_texture(capture, frames)
-    pose = DecodedPose(capture.name, capture.sequence, frames, phases, texture, board)
-    examined = partial(load_or_save_examination, store, capture, frames)
+    phases, texture = decode_capture(capture, look), capture_texture(capture, look.stack)
+    pose = DecodedPose(capture.name, capture.sequence, look, phases, texture, board)
+    examined = partial(load_or_save_examination, store, capture, look)
     judged = read_pose(pose, smoothing, True, examined, observed)
     inputs = {capture.name: capture.hash}
     evidence = {"evidence": to_plain(judged.evidence), "inputs": inputs}
@@ -179,18 +185,16 @@ def read_stored_poses(
             )
     cached = {name: load_judged(store, name, board, smoothing) for name in names}
     missing = [capture for capture in captures if cached[capture.name] is None]
-    ahead = compute_ahead(Capture.stack, missing)
+    ahead = compute_ahead(look_at_capture, missing)
     for name in names:
         judged = cached[name]
         if judged is None:
-            capture, frames = next(ahead)
+            capture, look = next(ahead)
             try:
-                judged = read_stored_pose(
-                    store, capture, frames.result(), board, smoothing, observed
-                )
+                judged = read_stored_pose(store, capture, look.result(), board, smoothing, observed)
             except DamagedError as error:
                 judged = Judged(name, None, str(error).removeprefix(f"{name}: "))
-            del frames  # before the next are waited for
+            del look  # before the next are waited for
         yield judged
 
 
@@ -226,7 +230,7 @@ def gather_evidence(
     """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
     None where they could not be read, for the reason ``refused``; ``examination``: of its frames.
     """
-    sequence, frames, board = pose.sequence, pose.frames, pose.board
+    sequence, frames, board = pose.sequence, pose.look.stack, pose.board
     grid, on_board, moved_px = None, None, np.nan
     if detection is None:
         grid = detect_grid_size(board, pose.texture)

@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic, measure_second_harmonic
 from slviewer.errors import InputError
-from slviewer.examination.light import estimate_frame_light
+from slviewer.examination.light import look_at
 from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
@@ -41,8 +41,8 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
     progress(0.0, "reading frames")
     frames, sequence = capture.stack(), capture.sequence
     progress(0.2, "comparing the frames")
-    light = estimate_frame_light(sequence, frames)
-    examination = examine_frames(sequence, frames, capture.files, light)
+    look = look_at(sequence, frames)
+    examination = examine_frames(sequence, frames, capture.files, look)
     compared = (
         _check_order(sequence, examination),
         _check_light(examination),
@@ -50,7 +50,7 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
     )
     progress(0.6, "decoding")
     try:
-        phases = decode_frames(capture.name, sequence, frames, light)
+        phases = decode_frames(capture.name, sequence, frames, look.light)
     except InputError as error:
         description = _check_description(capture.name, examination, error)
         return Preflight((description, *compared), None, None, None, time.monotonic() - began)

@@ -18,6 +18,7 @@ from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibr
 from slviewer.calibration.diagnosis.rules import FEW_POSES
 from slviewer.calibration.observe import Smoothing
 from slviewer.evaluation.render import Row
+from slviewer.examination.light import look_at
 from slviewer.fringe.decode import texture
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import p18
@@ -108,8 +109,9 @@ class FaultBench:
         """Read a capture with its evidence; ``sequence`` and ``board`` as described to the
         program."""
         name, sequence, board = f"pose_{i + 1:02d}", sequence or self.sequence, board or self.board
-        phases = decode_frames(name, sequence, frames)
-        pose = DecodedPose(name, sequence, frames, phases, texture(sequence, frames), board)
+        look = look_at(sequence, frames)
+        phases = decode_frames(name, sequence, frames, look.light)
+        pose = DecodedPose(name, sequence, look, phases, texture(sequence, frames), board)
         return read_pose(pose, Smoothing())
 
     def examine_clean(self, count: int | None = None) -> list[Judged]:

@@ -15,7 +15,7 @@ from fringe_scene import variants
 
 from slviewer.examination.examine import examine
 from slviewer.examination.findings import describe_light
-from slviewer.examination.light import estimate_frame_light
+from slviewer.examination.light import look_at
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import gray, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
@@ -148,8 +148,9 @@ def test_light_that_varies_is_corrected_and_named(
         pytest.xfail("frames of 0.46 to 1 times the light, in no order, are not separated yet")
     sequence, frames = photographed(real_data, name)
     faulty = with_fault(make_faulty, fault, frames, severity)
-    light = estimate_frame_light(sequence, faulty)
-    assert examine(sequence, faulty, light).rejected == ()
+    look = look_at(sequence, faulty)
+    assert examine(sequence, faulty, look).rejected == ()
+    light = look.light
     named = {f.cause for f in describe_light(sequence, light)}
     # the lamp is switched on between the axes of the shells, of which each sees steady light
     assert named <= causes and (named or (name, fault) == (SHELLS, "roomlight"))

@@ -8,6 +8,7 @@ import pytest
 from facts import raises
 
 from slviewer.errors import InputError
+from slviewer.examination.light import look_at
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
@@ -62,9 +63,10 @@ def test_frames_that_do_not_decode_are_explained(frames: np.ndarray) -> None:
     wide = replace(SEQUENCE, gray_cell_px=36.0)
     with pytest.raises(InputError):
         decode_frames("pose_01", wide, frames)
-    for decode in (decode_examined, decode_or_explain):
+    look = look_at(wide, frames)
+    for decode, given in ((decode_examined, frames), (decode_or_explain, look)):
         with raises(InputError, "pose_01", "gray_cell_px = 18"):
-            decode("pose_01", wide, frames)
+            decode("pose_01", wide, given)
 
 
 def seen(decoded: float, otherwise: Reason) -> PhaseMap:

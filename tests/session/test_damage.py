@@ -137,7 +137,6 @@ def test_a_damaged_pose_is_refused_and_the_others_are_read(session, sequence, fr
     for name in ("pose_1", "pose_2", "pose_3"):
         session.save_capture(name, "calibration", sequence, frames, source="")
     damage_file(session.folder / "captures/pose_2/frames.zarr/c.1.0.0", "zeros inside")
-    monkeypatch.setattr(poses, "decode_capture", lambda capture, stack: {})
     monkeypatch.setattr(
         poses,
         "read_stored_pose",
