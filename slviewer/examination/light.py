@@ -86,7 +86,9 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
         if not varying.issuperset(terms):
             continue
         light = _fit(fitted, base, terms, gains if "gain" in terms else constant)
-        gains = light if terms == ("gain",) else gains
+        if terms == ("gain",):  # misread bits lead astray from equal light, few fringes from means
+            other = _fit(fitted, base, terms, _start_from_means(fitted, base))
+            gains = light = min(light, other, key=lambda x: _score(judged, base, x, first))
         if len(terms) > 1 and not _is_large(base.sequence, light, "gain"):
             light = replace(light, gain=constant.gain, terms=terms[1:])
         is_large = _is_large(base.sequence, light, terms[-1])
@@ -94,6 +96,16 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
         if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
     return _accept(base.sequence, stack, best, score) if best.terms else constant
+
+
+def _start_from_means(evaluator: Evaluator, base: Hypothesis) -> FrameLight:
+    """Return the light whose gains are the frames' mean levels, over those of their axis."""
+    gain = np.ones(len(base.images))
+    for axis, sample in evaluator.sample.by_axis.items():
+        frames = evaluator.atoms(base, axis).frames
+        means = sample.levels[frames, 1].mean(axis=1) + 1
+        gain[frames] = means / np.exp(np.log(means).mean())
+    return replace(FrameLight.constant(len(gain)), gain=gain)
 
 
 def _accept(

