@@ -153,7 +153,10 @@ def hostile(folder: Path) -> dict[str, tuple[bytes, str]]:
         "none.stl": (stl[:80] + struct.pack("<I", 0), "triangles"),
         "short.ply": (ply[:-50], "damaged"),
         "many.ply": (ply.replace(b"element vertex 162", b"element vertex 99999999999"), "damaged"),
-        "more.ply": (ply.replace(b"element face 320", b"element face 9999999999999999"), "9,999,999,999,999,999"),
+        "more.ply": (
+            ply.replace(b"element face 320", b"element face 9999999999999999"),
+            "9,999,999,999,999,999",
+        ),
         "list.ply": (ply[: body + 162 * 12] + b"\xff" * (len(ply) - body - 162 * 12), "damaged"),
         "text.ply": (BALL.export(file_type="ply", encoding="ascii")[:-50], "320"),
         "nan.ply": (ply[:body] + struct.pack("<f", np.nan) + ply[body + 4 :], "NaN"),
