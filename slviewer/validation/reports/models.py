@@ -51,7 +51,7 @@ def _ply() -> bytes:
 
 def _3mf(build: str, objects: str = "") -> bytes:
     """Return a 3MF file of a box (object 1), a pin that supports it (2), and other objects."""
-    meshes = []
+    meshes: list[str] = []
     for kind, size in (("model", (20, 10, 5)), ("support", (3, 3, 40))):
         box = trimesh.creation.box(size)
         points = "".join('<vertex x="{}" y="{}" z="{}"/>'.format(*v) for v in box.vertices)
