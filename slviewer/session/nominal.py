@@ -1,9 +1,6 @@
 """A nominal model from a file: checked, cleaned, and in millimetres."""
 
 import hashlib
-import io
-import re
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from slviewer.errors import InputError, SessionError
 from slviewer.geometry.vectors import lengths
 from slviewer.session import cad
+from slviewer.session.polygons import Polygons, read_polygons, to_polygons, triangulate
 from slviewer.session.reading import expand_user, read_input
 from slviewer.surface.shapes import Mesh
 
@@ -23,17 +21,14 @@ NOMINALS = "nominal"
 """Folder of a session with the nominal models that were uploaded."""
 FORMATS = (".stl", ".ply", ".obj", ".step", ".stp", ".3mf")
 MAX_BYTES = 1 << 28
-MAX_TEXT_BYTES = 1 << 27
-"""Of a text STL or OBJ: its numbers need several times its size while they are parsed."""
-MAX_TRIANGLES = 2_000_000
-MAX_CORNERS = 1000
-"""Of a polygon in an OBJ."""
 MM: dict[Units, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 MAX_SIZE_RATIO = 5.0
 """A scan's size over the nominal's, or its inverse, from which on the units must be given."""
 MATCHING_SIZE_RATIO = 2.0
 """Units that bring the two so near are proposed."""
 MAX_COORDINATE_MM = 1e5
+MERGED_DECIMALS = 8
+"""Vertices that agree to this place of a mm are one."""
 MAX_DEGENERATE_SHARE = 0.5
 """Share of triangles without area from which on a file is refused."""
 
@@ -69,8 +64,8 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     in mm; or in a STEP or 3MF file, which states its units.
 
     Raises SessionError for a file that cannot be used, with the reason: one that is absent, too
-    large, damaged, truncated, of another format, without triangles, or with more than
-    `MAX_TRIANGLES`.
+    large, damaged, truncated, of another format, without triangles, or with too
+    many.
     """
     path = expand_user(path)
     if path.suffix.lower() not in FORMATS:
@@ -82,23 +77,16 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     data = read_input(path, MAX_BYTES, remedy, SessionError)
     notes: list[str] = []
     if (form := path.suffix.lower()[1:]) in cad.PACKAGES:
-        vertices, faces = cad.load_triangles(path.name, form, data)
+        vertices, faces = cad.load_triangles(path.name, form, data, notes)
+        polygons = to_polygons(vertices, faces)
         units = "mm"
-        if form != "3mf":
-            notes.append(f"its surfaces were triangulated within {cad.CHORD_MM:g} mm")
     else:
-        vertices, faces = _load_triangles(path.name, data)
-    _check_triangles(path.name, vertices, faces)
-    vertices = vertices * MM[units or "mm"]
-    if not np.abs(vertices).max() < MAX_COORDINATE_MM:
-        raise SessionError(
-            f"{path.name} reaches {np.abs(vertices).max():.3g} mm: models up to"
-            f" {MAX_COORDINATE_MM:g} mm are read; give its units, or move it to its origin"
-        )
-    vertices, faces = _drop_degenerate(path.name, vertices, faces, notes)
-    faces, closed = _orient_faces(vertices, faces, notes)
+        polygons = read_polygons(path.name, data, notes)
+    polygons = _merge_vertices(path.name, polygons, MM[units or "mm"])
+    faces = triangulate(polygons, notes)
+    mesh, closed = _repair(path.name, polygons.vertices, faces, notes)
     digest = hashlib.blake2b(data, digest_size=20).hexdigest()
-    return Nominal(Mesh(vertices, faces), path.name, digest, units, closed, tuple(notes))
+    return Nominal(mesh, path.name, digest, units, closed, tuple(notes))
 
 
 def check_size(nominal: Nominal, points: np.ndarray) -> None:
@@ -140,131 +128,63 @@ def _format_size(size: float) -> str:
     return f"{size:,.0f}" if size >= 100 else f"{size:#.3g}"
 
 
-def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (n, 3) float64 and faces (m, 3) int64 of a file, unchanged but for merged
-    duplicate vertices."""
-    import trimesh
+def _merge_vertices(name: str, polygons: Polygons, scale: float) -> Polygons:
+    """Return polygons in mm without duplicate vertices. Raises SessionError where there are none,
+    and for vertices that are missing, not numbers, or beyond what is read."""
+    from trimesh.grouping import unique_rows
 
-    form = name.rpartition(".")[2].lower()
-    data = _simplify(name, form, data)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            # from memory, so that other files that it may name are not opened; unprocessed, or
-            # points that are not numbers would be dropped
-            mesh: Any = trimesh.load(
-                io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False
-            )
-            mesh.merge_vertices(merge_tex=True, merge_norm=True)
-            vertices = np.asarray(mesh.vertices, np.float64)
-            faces = np.asarray(mesh.faces, np.int64)
-    except MemoryError as error:
-        raise SessionError(f"{name} does not fit into the memory: decimate it first") from error
-    except Exception as error:  # a file from anywhere may make its reader fail in any way
-        raise SessionError(
-            f"{name} cannot be read ({type(error).__name__}): it is damaged; export the model"
-            " again, as triangles"
-        ) from error
-    declared = _declared_faces(data) if form == "ply" else 0
-    # a text that breaks off is read as far as it goes
-    if len(faces) < declared:
-        raise SessionError(
-            f"{name} is truncated: {len(faces):,} of {declared:,} triangles were read;"
-            " export the model again"
-        )
-    return vertices, faces
-
-
-def _check_triangles(name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Raise SessionError where vertices and faces are not triangles, too many, or reach beyond what
-    is read."""
-    if not vertices.shape[1:] == faces.shape[1:] == (3,) or not len(faces):
+    vertices, corners, counts = polygons.vertices, polygons.corners, polygons.counts
+    if not (counts > 2).any():
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
-    if len(faces) > MAX_TRIANGLES:
-        raise _too_many(name, f"{len(faces):,} triangles")
-    if faces.min() < 0 or faces.max() >= len(vertices):
+    if corners.min() < 0 or corners.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
     if not np.isfinite(vertices).all():
         raise SessionError(
             f"{name} holds points that are not numbers (NaN or infinite): export the model again"
         )
-
-
-def _simplify(name: str, form: str, data: bytes) -> bytes:
-    """Return a file without what only costs time: the groups of an OBJ, all but one of the sections
-    of a text STL.
-
-    Raises SessionError for one of more triangles than are read, counted before anything is loaded.
-    """
-    is_text = form == "obj" or (form == "stl" and _is_text_stl(data))
-    if is_text and len(data) > MAX_TEXT_BYTES:
-        raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text")
-    if form == "obj":
-        data = b"\n".join(
-            re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b" "), re.MULTILINE)
+    vertices = scale * vertices
+    if not (reach := np.abs(vertices).max()) < MAX_COORDINATE_MM:
+        raise SessionError(
+            f"{name} reaches {reach:.3g} mm: models up to {MAX_COORDINATE_MM:g} mm are read; give"
+            " its units, or move it to its origin"
         )
-        faces = re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE)
-        corners = max((len(face.split()) for face in faces), default=0)
-        if corners > MAX_CORNERS:
-            raise SessionError(
-                f"{name} has a face of {corners - 1:,} corners: export the model again, as"
-                " triangles"
-            )
-        count = len(faces)
-    elif form == "ply":
-        count = _declared_faces(data)
-    elif is_text:
-        data = re.sub(rb"(?im)^[ \t]*endsolid[^\n]*\n\s*solid[^\n]*\n", b"", data)
-        count = data.lower().count(b"endfacet")
-    else:
-        count = int.from_bytes(data[80:84], "little")
-        if len(data) < 84 + 50 * count:
-            raise SessionError(
-                f"{name} holds no triangles, or is truncated: it announces {count:,} triangles;"
-                " export the model again"
-            )
-    if count > MAX_TRIANGLES:
-        raise _too_many(name, f"{count:,} triangles")
-    return data
+    first, same = unique_rows(vertices, digits=MERGED_DECIMALS)
+    return Polygons(vertices[first], same[corners], counts)
 
 
-def _declared_faces(data: bytes) -> int:
-    """Return the number of faces that the header of a PLY declares; 0 where it declares none."""
-    declared = re.search(rb"element face (\d{1,12})\b", data[:65536])
-    return int(declared[1]) if declared else 0
-
-
-def _is_text_stl(data: bytes) -> bool:
-    """Return whether an STL is text: it begins with "solid", and is not of the size that a binary
-    one announces."""
-    binary = len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
-    return data[:512].lstrip().lower().startswith(b"solid") and not binary
-
-
-def _too_many(name: str, amount: str) -> SessionError:
-    """Return the error for a model that is too large."""
-    return SessionError(
-        f"{name} has {amount}, and at most {MAX_TRIANGLES:,} triangles are read: decimate it first"
-    )
-
-
-def _drop_degenerate(
+def _repair(
     name: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces without triangles that have no area, and without the vertices that only
-    those had."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    sides = np.maximum(lengths(b - a), lengths(c - a))
-    sound = lengths(np.cross(b - a, c - a)) > 1e-9 * sides**2
-    flat = len(faces) - int(np.count_nonzero(sound))
-    if flat > MAX_DEGENERATE_SHARE * len(faces):
+) -> tuple[Mesh, bool]:
+    """Return the mesh of triangles that have an area, wound consistently, and whether it is closed.
+    Triangles without area that join others along their sides close a surface, too."""
+    sound = _have_area(vertices, faces)
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    if (flat := np.count_nonzero(~sound)) > MAX_DEGENERATE_SHARE * len(faces):
         raise SessionError(
             f"{flat:,} of the {len(faces):,} triangles in {name} have no area: export the model"
             " again"
         )
-    if flat:
-        notes.append(f"{flat:,} of {len(faces):,} triangles without area were removed")
-    faces = faces[sound]
+    for kept in (distinct, sound) if (distinct & ~sound).any() else (sound,):
+        repairs: list[str] = []
+        if removed := np.count_nonzero(~kept):
+            repairs.append(f"{removed:,} of {len(faces):,} triangles without area were removed")
+        found, closed = _orient_faces(vertices, _drop_repeated(faces[kept], repairs), repairs)
+        if closed:
+            break
+    notes += repairs
+    used, found = np.unique(found[_have_area(vertices, found)], return_inverse=True)
+    return Mesh(vertices[used].astype(np.float32), found.reshape(-1, 3).astype(np.int32)), closed
+
+
+def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return (m,) bool: whether triangles (m, 3) are more than a line."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    sides = np.maximum(lengths(b - a), lengths(c - a))
+    return np.asarray(lengths(np.cross(b - a, c - a)) > 1e-9 * sides**2)
+
+
+def _drop_repeated(faces: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Return the triangles (m, 3) without repetitions."""
     # the smallest index first, so that equal triangles have equal rows
     rolled = np.take_along_axis(
         faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1
@@ -275,9 +195,7 @@ def _drop_degenerate(
             f"{repeated:,} of {len(faces):,} triangles were repetitions of others: they were"
             " removed"
         )
-        faces = faces[np.sort(first)]
-    used, faces = np.unique(faces, return_inverse=True)
-    return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
+    return faces[np.sort(first)]
 
 
 def _orient_faces(
@@ -302,7 +220,7 @@ def _orient_faces(
             return faces, False
         faces = turned
         notes.append("its triangles did not all turn one way: they were turned")
-    if not (sides == 2).all():
+    if (sides == 1).any():
         notes.append("it is open: outside is where its triangles face")
         return faces, False
     if trimesh.Trimesh(mesh.vertices, faces, process=False).volume < 0:

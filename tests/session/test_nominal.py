@@ -13,7 +13,7 @@ import trimesh
 from facts import missing_facts, raises
 
 from slviewer.errors import InputError, SessionError
-from slviewer.session import nominal
+from slviewer.session import nominal, polygons
 from slviewer.session.nominal import check_size, read_nominal
 
 PLATE = Path(__file__).with_name("plate.step")
@@ -153,15 +153,18 @@ def hostile(folder: Path) -> dict[str, tuple[bytes, str]]:
         "none.stl": (stl[:80] + struct.pack("<I", 0), "triangles"),
         "short.ply": (ply[:-50], "damaged"),
         "many.ply": (ply.replace(b"element vertex 162", b"element vertex 99999999999"), "damaged"),
-        "more.ply": (ply.replace(b"element face 320", b"element face 9999999999999999"), "damaged"),
+        "more.ply": (
+            ply.replace(b"element face 320", b"element face 9999999999999999"),
+            "9,999,999,999,999,999",
+        ),
         "list.ply": (ply[: body + 162 * 12] + b"\xff" * (len(ply) - body - 162 * 12), "damaged"),
-        "text.ply": (BALL.export(file_type="ply", encoding="ascii")[:-50], "of 320 triangles"),
+        "text.ply": (BALL.export(file_type="ply", encoding="ascii")[:-50], "320"),
         "nan.ply": (ply[:body] + struct.pack("<f", np.nan) + ply[body + 4 :], "NaN"),
         "far.ply": (ply[:body] + struct.pack("<f", 1e30) + ply[body + 4 :], "1e+30 mm"),
         "endless.ply": (b"ply\n" + b"comment x\n" * 20_000, "damaged"),
-        "wrong.ply": (ascii_header + b"3 0 1 77\n", "damaged"),
+        "wrong.ply": (ascii_header + b"3 0 1 77\n", "missing"),
         "cloud.ply": (ascii_header.replace(b"face 1", b"face 0"), "triangles"),
-        "wrong.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "damaged"),
+        "wrong.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "missing"),
         "points.obj": (b"v 0 0 0\nv 1 0 0\n", "triangles"),
         "part.iges": (b"S      1", "STEP"),
     }
@@ -193,7 +196,7 @@ def test_size_and_triangles_are_limited_before_anything_is_loaded(
         file.truncate(nominal.MAX_BYTES + 1)  # sparse
     with raises(SessionError, "large.stl", "268 MB"):
         read_nominal(tmp_path / "large.stl")
-    monkeypatch.setattr(nominal, "MAX_TRIANGLES", 100)
+    monkeypatch.setattr(polygons, "MAX_TRIANGLES", 100)
     for name in ("many.stl", "many.ply", "many.obj"):
         BALL.export(tmp_path / name)
         with raises(SessionError, name, 320, 100):

@@ -1,0 +1,331 @@
+"""Polygons of STL, PLY and OBJ files as they stand there, and their triangles."""
+
+import codecs
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.errors import SessionError
+from slviewer.geometry.vectors import lengths
+from slviewer.session.cad import CHORD_MM
+
+MAX_TEXT_BYTES = 1 << 27
+"""Of a text file: its numbers need several times its size while they are parsed."""
+MAX_TRIANGLES = 2_000_000
+MAX_CORNERS = 10_000
+"""Of one polygon; and of all that cross themselves, for which clipping ears is slow."""
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_HEADER_BYTES = 84
+_PLY_TYPES = {
+    name: code
+    for names, code in {
+        "char int8": "i1",
+        "uchar uint8": "u1",
+        "short int16": "i2",
+        "ushort uint16": "u2",
+        "int int32": "i4",
+        "uint uint32": "u4",
+        "float float32": "f4",
+        "double float64": "f8",
+    }.items()
+    for name in names.split()
+}
+_NONE = np.empty(0, np.int64)
+_PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True, eq=False)
+class Polygons:
+    """``vertices`` (n, 3) float64; ``corners`` (k,) int64, the vertices of all polygons one after
+    another; ``counts`` (m,) int64, the number of corners of each polygon."""
+
+    vertices: np.ndarray
+    corners: np.ndarray
+    counts: np.ndarray
+
+
+def read_polygons(name: str, data: bytes, notes: list[str]) -> Polygons:
+    """Return the polygons in the content of an STL, PLY or OBJ file; what was repaired is appended
+    to ``notes``.
+
+    Raises SessionError, with the reason, for a file that is truncated, damaged or too large.
+    Corners may still refer to vertices that are missing.
+    """
+    try:
+        return _READERS[name.rpartition(".")[2].lower()](name, data, notes)
+    except MemoryError as error:
+        raise SessionError(f"{name} does not fit into the memory: decimate it first") from error
+    except (ValueError, LookupError, OverflowError, TypeError) as error:
+        raise SessionError(
+            f"{name} cannot be read ({error}): it is damaged; export the model again"
+        ) from error
+
+
+def to_polygons(vertices: np.ndarray, faces: np.ndarray) -> Polygons:
+    """Return triangles (m, 3), or (3 m,), between vertices (n, 3) as polygons."""
+    corners = faces.ravel().astype(np.int64)
+    return Polygons(vertices.astype(np.float64), corners, np.full(len(corners) // 3, 3))
+
+
+def triangulate(polygons: Polygons, notes: list[str]) -> np.ndarray:
+    """Return the triangles (m, 3) of polygons in mm, which turn as the polygons do; concave ones
+    are cut by clipping ears. Polygons that are not flat, or cross themselves, are named in
+    ``notes``. Raises SessionError for many that cross themselves.
+    """
+    vertices, counts = polygons.vertices, polygons.counts
+    starts = np.cumsum(counts) - counts
+    triangles, heights, crossing = [np.empty((0, 3), np.int64)], [np.empty(0)], []
+    for k in np.unique(counts[counts > 2]):
+        rows = polygons.corners[starts[counts == k][:, None] + np.arange(k)]
+        if k == 3:
+            triangles.append(rows)
+            continue
+        for turn in range(2):  # one of the two fans fits every quadrilateral
+            edges = vertices[rows[:, 1:]] - vertices[rows[:, :1]]
+            fan = np.cross(edges[:, :-1], edges[:, 1:])
+            normal = fan.sum(axis=1)
+            area = lengths(normal)
+            normal /= np.maximum(area, np.finfo(float).tiny)[:, None]
+            if not turn:
+                above = np.einsum("mkc,mc->mk", edges, normal)
+                heights.append(above.max(axis=1).clip(0) - above.min(axis=1).clip(max=0))
+            fits = (np.einsum("mkc,mc->mk", fan, normal) > 1e-9 * area[:, None]).all(axis=1)
+            triangles += [rows[fits][:, [0, i, i + 1]] for i in range(1, k - 1)]
+            rows = np.roll(rows[~fits], -1, axis=1)
+        for row in rows:
+            found, is_simple = _clip_ears(vertices[row])
+            triangles.append(row[found])
+            crossing += [] if is_simple else [k]
+            if sum(crossing) > MAX_CORNERS:
+                raise SessionError(
+                    f"{len(crossing):,} polygons or more cross themselves, one of {k:,} corners:"
+                    " export the model again, as triangles"
+                )
+    if len(uneven := (height := np.concatenate(heights))[height > CHORD_MM]):
+        notes.append(
+            f"{len(uneven):,} of {len(counts):,} polygons are not flat, by up to"
+            f" {uneven.max():.2g} mm: their surface is not defined any closer"
+        )
+    if crossing:
+        notes.append(
+            f"{len(crossing):,} of {len(counts):,} polygons cross themselves, and their surface is"
+            " not defined: export the model as triangles if it matters there"
+        )
+    return np.concatenate(triangles)
+
+
+def _clip_ears(points: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the triangles (m, 3) of one polygon (k, 3), and whether they cover it exactly."""
+    from mapbox_earcut import triangulate_float64
+
+    edges = points - points[0]
+    normal = np.cross(edges[1:-1], edges[2:]).sum(axis=0)
+    axis = int(np.argmax(np.abs(normal)))
+    flat = np.delete(edges, axis, axis=1)
+    triangles = triangulate_float64(flat, np.array([len(flat)])).reshape(-1, 3).astype(np.int64)
+    a, b, c = (edges[triangles[:, i]] for i in range(3))
+    areas = np.cross(b - a, c - a)[:, axis]
+    turned = areas * normal[axis] < 0
+    triangles[turned] = triangles[turned][:, ::-1]
+    return triangles, bool(np.isclose(np.abs(areas).sum(), abs(normal[axis]), rtol=1e-6))
+
+
+def too_many(name: str, amount: str) -> SessionError:
+    """Return the error for a model that is too large."""
+    return SessionError(
+        f"{name} has {amount}, and at most {MAX_TRIANGLES:,} triangles are read: decimate it first"
+    )
+
+
+def _to_text(name: str, data: bytes) -> bytes:
+    """Return a text without byte order mark, its lines ended by line feeds."""
+    if len(data) > MAX_TEXT_BYTES:
+        raise too_many(name, f"{len(data) / 1e6:.0f} MB of text")
+    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        data = data.decode("utf-16").encode()
+    return data.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+
+
+def _with_points(numbers: bytes, notes: list[str]) -> bytes:
+    """Return numbers whose decimal commas, where no point occurs beside them, are points."""
+    if b"," not in numbers or b"." in numbers:
+        return numbers
+    notes.append("the commas in its numbers were read as decimal points")
+    return numbers.replace(b",", b".")
+
+
+def _read_obj(name: str, data: bytes, notes: list[str]) -> Polygons:
+    """Return the polygons of an OBJ; indices below zero count from the line where they stand."""
+    text = _to_text(name, data).replace(b"\\\n", b" ")
+    lines = re.findall(rb"^[ \t]*([vf])[ \t]([^\n#]*)", text, re.MULTILINE)
+    is_vertex = np.array([kind == b"v" for kind, _ in lines], bool)
+    numbers = _with_points(b"\n".join(rest for kind, rest in lines if kind == b"v"), notes)
+    vertices = np.array([line.split()[:3] for line in numbers.splitlines()], np.float64)
+    faces = [rest.split() for kind, rest in lines if kind == b"f"]
+    counts = np.array([len(face) for face in faces], np.int64)
+    _check_counts(name, counts)
+    corners = np.array([corner.partition(b"/")[0] for face in faces for corner in face], np.int64)
+    before = np.repeat(np.cumsum(is_vertex)[~is_vertex], counts)
+    corners = np.where(corners < 0, corners + before, corners - 1)
+    return Polygons(vertices.reshape(-1, 3), corners, counts)
+
+
+def _read_stl(name: str, data: bytes, notes: list[str]) -> Polygons:
+    """Return the triangles of an STL: a binary one, whatever its header says, where the file holds
+    as many as it announces."""
+    count = int.from_bytes(data[80:_HEADER_BYTES], "little")
+    end = _HEADER_BYTES + count * _FACET.itemsize
+    if not _HEADER_BYTES <= end <= len(data):
+        head = _to_text(name, data[:4096])
+        if b"\0" not in head[:_HEADER_BYTES] and re.search(rb"(?i)\b(solid|facet)\b", head):
+            return _read_text_stl(name, data, notes)
+        held = max(0, len(data) - _HEADER_BYTES) // _FACET.itemsize
+        raise SessionError(
+            f"{name} is truncated, or no STL: it announces {count:,} triangles and holds {held:,};"
+            " export the model again"
+        )
+    rest = len(data) - end
+    if rest >= _FACET.itemsize and data[end:].strip(b"\0\t\n\r\x1a "):
+        raise SessionError(
+            f"{name} announces {count:,} triangles and holds"
+            f" {count + rest // _FACET.itemsize:,}: export the model again"
+        )
+    if rest:
+        notes.append(f"{rest:,} bytes after the last of its {count:,} triangles were skipped")
+    _check_counts(name, np.full(count, 3))
+    vertices = np.frombuffer(data, _FACET, count, _HEADER_BYTES)["corners"].reshape(-1, 3)
+    return to_polygons(vertices, np.arange(3 * count))
+
+
+def _read_text_stl(name: str, data: bytes, notes: list[str]) -> Polygons:
+    """Return the triangles of a text STL, of one or more solids."""
+    text = _to_text(name, data).lower()
+    is_whole = text.rfind(b"endsolid") > text.rfind(b"endfacet")
+    text = re.sub(rb"^[ \t]*(end)?solid\b[^\n]*?(?=\n|\sfacet\s|\Z)", b"", text, flags=re.MULTILINE)
+    begun, ended = (len(re.findall(rb"\b%s\b" % word, text)) for word in (b"facet", b"endfacet"))
+    if not is_whole or begun != ended:
+        raise SessionError(
+            f"{name} is truncated: it ends after {ended:,} triangles, without an 'endsolid';"
+            " export the model again"
+        )
+    _check_counts(name, np.full(ended, 3))
+    rows = re.findall(rb"\bvertex\s+(\S+\s+\S+\s+\S+)", text)
+    if len(rows) != 3 * ended:
+        raise SessionError(
+            f"{name} has {len(rows):,} corners in {ended:,} facets, which are triangles in an STL:"
+            " export the model again"
+        )
+    numbers = _with_points(b" ".join(rows), notes)
+    vertices = np.array(numbers.split(), np.float64).reshape(-1, 3)
+    return to_polygons(vertices, np.arange(3 * ended))
+
+
+def _read_ply(name: str, data: bytes, notes: list[str]) -> Polygons:
+    """Return the polygons of a PLY, text or binary."""
+    data = data.removeprefix(codecs.BOM_UTF8)
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data[:65536])
+    if end is None or not data.startswith(b"ply"):
+        raise ValueError("it has no header of a PLY")
+    order, elements = _parse_ply_header(data[: end.start()].decode("latin-1"))
+    count = elements["face"][0] if "face" in elements else 0
+    if count > MAX_TRIANGLES:
+        raise too_many(name, f"{count:,} triangles")
+    body = data[end.end() :]
+    if not order:  # a text is read as if its numbers were binary
+        numbers = _with_points(_to_text(name, body), notes)
+        body = np.array(numbers.split(), np.float64).tobytes()
+    try:
+        rows, position = {}, 0
+        for element, (count, properties) in elements.items():
+            rows[element], position = _read_ply_rows(body, position, count, properties)
+    except ValueError as error:
+        raise SessionError(
+            f"{name} is truncated, or damaged: not all of its {count:,} elements of the kind"
+            f" '{element}' can be read; export the model again"
+        ) from error
+    vertices = np.stack([rows["vertex"][axis][0] for axis in "xyz"], axis=-1).astype(np.float64)
+    faces = rows.get("face", {})
+    corners, counts = faces.get("vertex_indices") or faces.get("vertex_index") or (_NONE, _NONE)
+    _check_counts(name, counts)
+    return Polygons(vertices, corners.astype(np.int64), counts.astype(np.int64))
+
+
+def _parse_ply_header(
+    header: str,
+) -> tuple[str, dict[str, tuple[int, list[tuple[str, str, str]]]]]:
+    """Return the byte order of a PLY ("": it is text), and of each element the number and the
+    properties: name, type, and for a list the type of its length."""
+    order, elements = "", {}
+    properties: list[tuple[str, str, str]] = []
+    for words in (line.split() for line in header.splitlines()):
+        if words[:1] == ["format"]:
+            order = _PLY_ORDERS[words[1]]
+        elif words[:1] == ["element"]:
+            properties = []
+            elements[words[1]] = int(words[2]), properties
+        elif words[:1] == ["property"]:
+            kinds = [_PLY_TYPES[word] for word in words[1:-1] if word != "list"]
+            codes = [order + kind if order else "<f8" for kind in kinds]
+            properties.append((words[-1], codes[-1], codes[0] if len(codes) > 1 else ""))
+    return order, elements
+
+
+def _read_ply_rows(
+    body: bytes, position: int, count: int, properties: list[tuple[str, str, str]]
+) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
+    """Return of each property the values (k,) of ``count`` elements and the number of them in each
+    element, and the position after the last. Raises ValueError where the file ends before."""
+    if not count:
+        return {}, position
+    first = _walk_ply_rows(body, position, 1, properties)[0]
+    row = np.dtype(
+        [
+            field
+            for name, code, length in properties
+            for field in ([(f"{name}#", length)] if length else [])
+            + [(name, code, (int(first[name][1][0]),))]
+        ]
+    )
+    if position + count * row.itemsize <= len(body):
+        rows = np.frombuffer(body, row, count, position)
+        sizes = {name: row[name].shape[0] for name, _, _ in properties}
+        if all((rows[f"{name}#"] == sizes[name]).all() for name, _, length in properties if length):
+            values = {name: (rows[name].ravel(), np.full(count, n)) for name, n in sizes.items()}
+            return values, position + rows.nbytes
+    return _walk_ply_rows(body, position, count, properties)
+
+
+def _walk_ply_rows(
+    body: bytes, position: int, count: int, properties: list[tuple[str, str, str]]
+) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
+    """Return what `_read_ply_rows` does, element by element, whose lists may differ in length."""
+    values: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in properties}
+    for _ in range(count):
+        for name, code, length in properties:
+            number = 1
+            if length:
+                number = int(np.frombuffer(body, length, 1, position)[0])
+                position += np.dtype(length).itemsize
+            if not 0 <= number <= len(body):
+                raise ValueError(f"a list of {number}")
+            values[name].append(np.frombuffer(body, code, number, position))
+            position += values[name][-1].nbytes
+    return {
+        name: (np.concatenate(parts), np.array([len(part) for part in parts]))
+        for name, parts in values.items()
+    }, position
+
+
+_READERS = {"stl": _read_stl, "ply": _read_ply, "obj": _read_obj}
+
+
+def _check_counts(name: str, counts: np.ndarray) -> None:
+    """Raise SessionError for polygons of ``counts`` (m,) corners that are too many or too large."""
+    if (triangles := int((counts - 2).clip(0).sum())) > MAX_TRIANGLES:
+        raise too_many(name, f"{triangles:,} triangles or more")
+    if len(counts) and counts.max() > MAX_CORNERS:
+        raise SessionError(
+            f"{name} has a polygon of {counts.max():,} corners, more than {MAX_CORNERS:,}: export"
+            " the model again, as triangles"
+        )
