@@ -1,6 +1,7 @@
 """Findings in words: for each cause what was observed, and what to do."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from math import ceil, floor
 
 import numpy as np
 
@@ -52,6 +53,9 @@ REMEDIES: dict[Cause, str] = {
 """What to do, where it does not depend on values."""
 
 
+AND, OFFSETS, JOINT = " and phase_offset = ", 48, 0.5
+"""Between two values of a remedy; offsets of the phase that are tried with another width of cells;
+and by how much more these must explain."""
 _Change = tuple[str, Mapping[str, PatternSequence]]
 """A remedy with {} for its value, and the description that follows from each value."""
 
@@ -95,7 +99,7 @@ def _try_changes(
         if (m := evaluator.match(described(sequence), axis)) is not None:
             misfits[value] = float(m.misfit.mean())
     own = evaluator.match(hypothesis, axis)
-    best = min(misfits, key=lambda value: misfits[value], default="")
+    best = min(misfits, key=lambda value: misfits[value] * (1 + JOINT * (AND in value)), default="")
     if own is None or not best:
         return ""
     is_as_good = misfits[best] <= limits.AS_LITTLE * float(own.misfit.mean()) + limits.SMALL_LOSS
@@ -208,7 +212,7 @@ def _describe_convention(
         return (
             f"a cell of the Gray code of axis {axis} is {widths[0]} times as wide as a fringe, and"
             f" {widths[1]} times by the description",
-            [_change("set gray_cell_px = {}", base, axis, "gray_cell_px", *_list_near(value))],
+            [_change_cell("set gray_cell_px = {}", base, axis, value)],
         )
     if cause == "gray-origin":
         text = "set gray_origin = {} (px; of a PatternSequence: gray_origin_px)"
@@ -219,14 +223,29 @@ def _describe_convention(
     described_px = base.periods_px(axis)[-1]
     changes = [_change("set period_px = {}", base, axis, "period_px", *_list_near(value))]
     if base.find("gray", axis):
-        cells = _list_near(base.gray_cell(axis) * described_px / value)
+        cell = base.gray_cell(axis) * described_px / value
         text = "set gray_cell_px = {} if the period is right"
-        changes.append(_change(text, base, axis, "gray_cell_px", *cells))
+        changes.append(_change_cell(text, base, axis, cell))
     return (
         f"the finest fringe period of axis {axis} is {value:.3g} px, and the description says"
         f" {described_px:.3g}",
         changes,
     )
+
+
+def _change_cell(text: str, sequence: PatternSequence, axis: Axis, cell_px: float) -> _Change:
+    """Return the change of the Gray cells of a sequence to widths near one that was measured; also
+    to whole ones of phase steps that begin elsewhere, which imitate another width."""
+    text, tried = _change(text, sequence, axis, "gray_cell_px", *_list_near(cell_px))
+    joint = dict(tried)
+    widths = {f(px) for px in (cell_px, sequence.gray_cell(axis)) for f in (floor, ceil)}
+    for width in sorted(widths - {0}) if sequence.periods_px(axis) else ():
+        for k in range(1, OFFSETS):
+            offset = sequence.offset_rad(axis) + 2 * np.pi * wrap(k / OFFSETS)
+            values = {"gray_cell_px": float(width), "phase_offset_rad": round(offset, 3)}
+            key = f"{width}{AND}{offset:.3f}"
+            joint[key] = change_conventions(sequence, axis, **values)
+    return text, joint
 
 
 def _list_near(value: float) -> list[str]:
