@@ -183,8 +183,8 @@ def lowest_white(sequence: PatternSequence, samples: Sequence[np.ndarray]) -> in
     return min(plateaus, default=sequence.full_scale)
 
 
-def sample_phase_steps(sequence: PatternSequence, frames: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the levels (k, p) of evenly spread pixels in the k phase steps of frames (h, w)."""
+def sample_phase_steps(sequence: PatternSequence, frames: np.ndarray) -> np.ndarray:
+    """Return the levels (k, p) of evenly spread pixels in the k phase steps of frames (n, h, w)."""
     steps = [i for i, frame in enumerate(sequence.frames) if frame.kind == "phase"]
     height, width = frames[0].shape
     rows = np.unique(np.linspace(0, height - 1, min(SAMPLED_ROWS, height)).astype(int))

@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+from fringe_scene import capture, slope
 
+from slviewer.fringe.decode import decode
 from slviewer.fringe.layout import image_white
 from slviewer.fringe.plateau import find_plateau
+from slviewer.fringe.presets import gray_bits, phase_steps
+from slviewer.fringe.sequence import PatternSequence
 
 RNG = np.random.default_rng(0)
 
@@ -63,3 +67,16 @@ def test_one_image_shows_a_plateau_of_a_single_level():
     assert image_white(image.clip(0, 300).astype(np.uint16)) == pytest.approx(300, abs=1)
     evenly = np.rint(RNG.normal(200, 0.6, (300, 400))).astype(np.uint8)
     assert image_white(evenly) == 255
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize("cell_px", [21.0, 23.0, 26.0])
+def test_gray_cells_about_as_wide_as_a_fringe_decode(cell_px):
+    frames = (*phase_steps("x", 4, 22.5), *gray_bits("x", 4))
+    sequence = PatternSequence((256, 128), frames, gray_cell_px=cell_px)
+    coordinate = slope(80, 200, start=20.0)
+    phase = decode(sequence, capture(sequence, coordinate), "x")
+    error = np.abs(phase.coordinate - coordinate)[phase.mask]
+    assert phase.mask.mean() > 0.6
+    assert 1e-3 < np.median(error) < 0.1
+    assert error.max() < 1.0

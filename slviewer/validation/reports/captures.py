@@ -30,8 +30,8 @@ def _photograph(
     extent = levels.shape[1]
     columns = np.linspace(5, extent - 6, WIDTH) + np.linspace(0, 3, HEIGHT)[:, None]
     fine = np.repeat(levels.astype(np.float32), 8, axis=1)
-    fine = cv2.GaussianBlur(fine, (0, 0), 5.0, sigmaY=1e-3, borderType=cv2.BORDER_REPLICATE)
-    seen = fine[:, ((columns + 0.5) * 8).astype(int)]
+    blurred = cv2.GaussianBlur(fine, (0, 0), 5.0, sigmaY=1e-3, borderType=cv2.BORDER_REPLICATE)
+    seen = blurred[:, ((columns + 0.5) * 8).astype(int)]
     albedo = brightness * (0.5 + 0.5 * np.linspace(0, 1, HEIGHT)[:, None])
     noise = np.random.default_rng(3).normal(0, NOISE, seen.shape)
     return black + albedo * seen + noise, columns
@@ -104,14 +104,12 @@ def _judge_cells(
         rejected = examine(sequence, images).rejected
         if not rejected:
             break
-        if not (named := re.search(r"(gray_cell_px|phase_offset) = ([-\d.]+)", rejected[0].remedy)):
+        found = re.findall(r"(gray_cell_px|phase_offset) = ([-\d.]+)", rejected[0].remedy)
+        if not found:
             return Outcome(rejected[0].text(), "a remedy that names a value", False)
-        name = named[1] if named[1] == "gray_cell_px" else "phase_offset_rad"
-        followed.append(named[0])
-        sequence = replace(sequence, **{name: float(named[2])})
-        if offset := re.search(r"and phase_offset = ([-\d.]+)", rejected[0].remedy):
-            followed.append(offset[0])
-            sequence = replace(sequence, phase_offset_rad=float(offset[1]))
+        followed += [" = ".join(each) for each in found]
+        values = {name: float(value) for name, value in found}
+        sequence = PatternSequence.from_dict({**sequence.to_dict(), **values})
     phase = decode(sequence, images, "x")
     errors = _measure_errors(phase, seen)
     wrong, rms = float(np.mean(errors > 0.6)), float(np.sqrt(np.mean(errors**2)))
