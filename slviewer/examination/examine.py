@@ -67,7 +67,7 @@ def _judge(
     if motion and _is_moving_still(evaluator, found, motion):
         found = ()
     if found and not (ghost and is_first):
-        return _describe_explanation(found, sequence)
+        return _describe_explanation(found, evaluator, base)
     coordinates = [*_judge_coordinates(evaluator, base)]
     # codes that cannot be are displaced as well
     if motion and not ghost and not coordinates:
@@ -117,20 +117,22 @@ def _is_moving_still(
     return False
 
 
-def _describe_explanation(found: Explanation, sequence: PatternSequence) -> list[Finding]:
+def _describe_explanation(
+    found: Explanation, evaluator: Evaluator, base: Hypothesis
+) -> list[Finding]:
     """Return the findings of an explanation.
 
     An offset of the phase that is no convention, on one axis of several periods captured one after
     the other, is motion between them.
     """
-    first, axis = found[0], found[0].axis
+    sequence, first, axis = base.sequence, found[0], found[0].axis
     is_offset = len(found) == 1 and first.cause == "phase-offset" and len(sequence.axes) == 2
     if axis is not None and is_offset and not sequence.find("gray", axis):
         *_, (period, steps) = sequence.phase_shifts(axis)
         turns = wrap((first.sequence.offset_rad(axis) - sequence.offset_rad(axis)) / (2 * np.pi))
         if all(abs(wrap(turns * n)) > limits.USUAL_OFFSET * n for n in (4, len(steps))):
             return [describe_motion(sequence, axis, turns * period)]
-    return [describe_hypothesis(hypothesis, sequence) for hypothesis in found]
+    return [describe_hypothesis(hypothesis, evaluator, base) for hypothesis in found]
 
 
 def _fill_in(hypothesis: Hypothesis) -> Hypothesis:

@@ -1,15 +1,19 @@
 """Findings in words: for each cause what was observed, and what to do."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from math import ceil, floor
 
 import numpy as np
 
+from slviewer.errors import InputError
 from slviewer.examination import limits
-from slviewer.examination.evaluate import Hypothesis
+from slviewer.examination.evaluate import Evaluator, Hypothesis, described
+from slviewer.examination.hypotheses import change_conventions, scale_finest_period
 from slviewer.examination.sample import CaptureSample
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.frame_light import FrameLight, Term
-from slviewer.fringe.layout import Layout
+from slviewer.fringe.layout import Layout, axis_layout
+from slviewer.fringe.levels import layout_levels
 from slviewer.fringe.origin import LATEST_TURNS
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.records.verdict import Cause, Finding, Severity
@@ -49,18 +53,57 @@ REMEDIES: dict[Cause, str] = {
 """What to do, where it does not depend on values."""
 
 
-def describe_hypothesis(hypothesis: Hypothesis, base: PatternSequence) -> Finding:
-    """Return the finding that a hypothesis stands for; ``base``: the sequence as described."""
+AND, OFFSETS, JOINT = " and phase_offset = ", 48, 0.5
+"""Between two values of a remedy; offsets of the phase that are tried with another width of cells;
+and by how much more these must explain."""
+_Change = tuple[str, Mapping[str, PatternSequence]]
+"""A remedy with {} for its value, and the description that follows from each value."""
+
+
+def describe_hypothesis(hypothesis: Hypothesis, evaluator: Evaluator, base: Hypothesis) -> Finding:
+    """Return the finding that a hypothesis stands for; ``base``: the capture as described."""
     cause = hypothesis.cause
     assert cause is not None
     if hypothesis.axis is None:
         sentence, remedy = _describe_order(hypothesis)
     else:
-        sentence, remedy = _describe_convention(hypothesis, base, hypothesis.axis)
+        sentence, changes = _describe_convention(hypothesis, base.sequence, hypothesis.axis)
+        tried = (_try_changes(evaluator, hypothesis, *change) for change in changes)
+        remedy = ", or ".join(text for text in tried if text)
+        remedy = remedy or REMEDIES["unreadable"]
     value = None if hypothesis.value is None else float(hypothesis.value)
     return Finding(
         cause, "rejected", sentence, remedy, (), hypothesis.frames, hypothesis.axis, value
     )
+
+
+def _try_changes(
+    evaluator: Evaluator,
+    hypothesis: Hypothesis,
+    text: str,
+    sequences: Mapping[str, PatternSequence],
+) -> str:
+    """Return the remedy ``text`` with the value, of those of the ``sequences`` that make the
+    capture decode, that explains the images best; empty where none explains them as well as the
+    hypothesis."""
+    axis = hypothesis.axis
+    assert axis is not None
+    misfits = {}
+    for value, sequence in sequences.items():
+        try:
+            layout = axis_layout(sequence, axis)
+            if layout.shifts and not layout.numbers_periods:
+                layout_levels(layout)
+        except InputError:
+            continue
+        if (m := evaluator.match(described(sequence), axis)) is not None:
+            misfits[value] = float(m.misfit.mean())
+    own = evaluator.match(hypothesis, axis)
+    best = min(misfits, key=lambda value: misfits[value] * (1 + JOINT * (AND in value)), default="")
+    if own is None or not best:
+        return ""
+    is_as_good = misfits[best] <= limits.AS_LITTLE * float(own.misfit.mean()) + limits.SMALL_LOSS
+    return text.format(best) if is_as_good else ""
 
 
 def _describe_lag(hypothesis: Hypothesis) -> tuple[str, str]:
@@ -125,61 +168,97 @@ def _describe_order(hypothesis: Hypothesis) -> tuple[str, str]:
 
 def _describe_convention(
     hypothesis: Hypothesis, base: PatternSequence, axis: Axis
-) -> tuple[str, str]:
-    """Return observation and remedy of a convention of one axis."""
-    sequence, value = hypothesis.sequence, hypothesis.value
+) -> tuple[str, list[_Change]]:
+    """Return observation and possible remedies of a convention of one axis."""
+    sequence, value = hypothesis.sequence, hypothesis.value or 0.0
     offset = sequence.offset_rad(axis)
     turns = (offset - base.offset_rad(axis)) / (2 * np.pi)
-    if hypothesis.cause == "phase-offset":
-        remedy = f"set phase_offset = {offset:.3f} (rad; of a PatternSequence: phase_offset_rad)"
+    cause = hypothesis.cause
+    if cause == "phase-offset":
+        text = "set phase_offset = {} (rad; of a PatternSequence: phase_offset_rad)"
+        changes = [_change(text, base, axis, "phase_offset_rad", f"{offset:.3f}")]
         if base.find("gray", axis):
             period = base.periods_px(axis)[-1]
             begin = base.origin_px(axis) / period + turns
             origin = (begin - np.ceil(begin - LATEST_TURNS)) * period
-            remedy += f", or gray_origin = {origin:.2f} (px; gray_origin_px) if the phase is right"
+            text = "set gray_origin = {} (px; gray_origin_px) if the phase is right"
+            changes.append(_change(text, base, axis, "gray_origin_px", f"{origin:.2f}"))
         return (
             f"the phase steps of axis {axis} begin {describe_turns(turns)} than described",
-            remedy,
+            changes,
         )
-    if hypothesis.cause == "step-order":
+    if cause == "step-order":
         also = f" and phase_offset = {offset:.3f}" if abs(turns) > 1e-6 else ""
         order = ", or number the steps backwards" if also else ""
+        text = f"set phase_sign = {sequence.sign(axis)}{also} for axis {axis}{order}"
         return (
             f"the fringes of axis {axis} shift in the opposite direction to the description",
-            f"set phase_sign = {sequence.sign(axis)}{also} for axis {axis}{order}",
+            [(text, {"": sequence})],
         )
-    if hypothesis.cause == "bit-order" and sequence.find("gray", axis) != base.find("gray", axis):
+    if cause == "bit-order" and sequence.find("gray", axis) != base.find("gray", axis):
         return (
             f"the Gray bits of axis {axis} and their inverses have changed places",
-            "exchange gray and inverse frames in the description",
+            [("exchange gray and inverse frames in the description", {"": sequence})],
         )
-    if hypothesis.cause == "bit-order":
+    if cause == "bit-order":
         order = ", ".join(str(sequence.frames[i].bit) for i in base.bits("gray", axis))
         return (
             f"the Gray bits of axis {axis} do not have the described order",
-            f"number them {order} (0 is the most significant)",
+            [(f"number them {order} (0 is the most significant)", {"": sequence})],
         )
-    if hypothesis.cause == "gray-cell":
+    if cause == "gray-cell":
         period = base.period_px(axis)
-        widths = [f"{cell / period:.3g}" for cell in (value or 0.0, base.gray_cell(axis))]
+        widths = [f"{cell / period:.3g}" for cell in (value, base.gray_cell(axis))]
         return (
             f"a cell of the Gray code of axis {axis} is {widths[0]} times as wide as a fringe, and"
             f" {widths[1]} times by the description",
-            f"set gray_cell_px = {value:.4g}",
+            [_change_cell("set gray_cell_px = {}", base, axis, value)],
         )
-    if hypothesis.cause == "gray-origin":
+    if cause == "gray-origin":
+        text = "set gray_origin = {} (px; of a PatternSequence: gray_origin_px)"
         return (
             f"the Gray code of axis {axis} begins elsewhere than described",
-            f"set gray_origin = {value:.2f} (px; of a PatternSequence: gray_origin_px)",
+            [_change(text, base, axis, "gray_origin_px", f"{value:.2f}")],
         )
-    described = base.periods_px(axis)[-1]
-    cell = base.gray_cell(axis) * described / (value or described)
-    or_cell = f", or gray_cell_px = {cell:.4g} if the period is right"
+    described_px = base.periods_px(axis)[-1]
+    changes = [_change("set period_px = {}", base, axis, "period_px", *_list_near(value))]
+    if base.find("gray", axis):
+        cell = base.gray_cell(axis) * described_px / value
+        text = "set gray_cell_px = {} if the period is right"
+        changes.append(_change_cell(text, base, axis, cell))
     return (
         f"the finest fringe period of axis {axis} is {value:.3g} px, and the description says"
-        f" {described:.3g}",
-        f"set period_px = {value:.4g}{or_cell if base.find('gray', axis) else ''}",
+        f" {described_px:.3g}",
+        changes,
     )
+
+
+def _change_cell(text: str, sequence: PatternSequence, axis: Axis, cell_px: float) -> _Change:
+    """Return the change of the Gray cells of a sequence to widths near one that was measured; also
+    to whole ones of phase steps that begin elsewhere, which imitate another width."""
+    text, tried = _change(text, sequence, axis, "gray_cell_px", *_list_near(cell_px))
+    joint = dict(tried)
+    widths = {f(px) for px in (cell_px, sequence.gray_cell(axis)) for f in (floor, ceil)}
+    for width in sorted(widths - {0}) if sequence.periods_px(axis) else ():
+        for k in range(1, OFFSETS):
+            offset = sequence.offset_rad(axis) + 2 * np.pi * wrap(k / OFFSETS)
+            values = {"gray_cell_px": float(width), "phase_offset_rad": round(offset, 3)}
+            key = f"{width}{AND}{offset:.3f}"
+            joint[key] = change_conventions(sequence, axis, **values)
+    return text, joint
+
+
+def _list_near(value: float) -> list[str]:
+    """Return a width in px as it was measured, and whole and half ones beside it, as text."""
+    return list(dict.fromkeys((f"{round(value):g}", f"{round(2 * value) / 2:g}", f"{value:.4g}")))
+
+
+def _change(text: str, sequence: PatternSequence, axis: Axis, name: str, *values: str) -> _Change:
+    """Return the change of one entry of a sequence to each of the values, which are in place of {}
+    in the text."""
+    if name == "period_px":
+        return text, {v: scale_finest_period(sequence, axis, float(v)) for v in values}
+    return text, {v: change_conventions(sequence, axis, **{name: float(v)}) for v in values}
 
 
 def wrap(turns: float) -> float:

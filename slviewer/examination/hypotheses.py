@@ -221,18 +221,25 @@ def _scale_periods(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothesis
     cell = {"gray_cell_px": sequence.gray_cell(axis)} if bits else {}
     for k in (*range(-count, 0), *range(1, count + 1)):
         period = finest * float(np.exp(0.25 * k / count))
-
-        def scale(frame: Frame, period: float = period) -> Frame:
-            """Return a frame of the finest period with another one."""
-            own = frame.kind == "phase" and frame.axis == axis and frame.period_px == finest
-            return replace(frame, period_px=period) if own else frame
-
         try:
-            scaled = replace(sequence, frames=tuple(map(scale, sequence.frames)))
+            scaled = scale_finest_period(sequence, axis, period)
         except InputError:  # it is another of the periods
             continue
         changed = described(change_conventions(scaled, axis, **cell))
         yield replace(changed, cause="fringe-period", axis=axis, value=period, cost=CHANGE_COST)
+
+
+def scale_finest_period(sequence: PatternSequence, axis: Axis, period_px: float) -> PatternSequence:
+    """Return the sequence with another finest period of an axis. Raises InputError where it is
+    another of the periods."""
+    finest = sequence.periods_px(axis)[-1]
+
+    def scale(frame: Frame) -> Frame:
+        """Return a frame of the finest period with the other one."""
+        own = frame.kind == "phase" and frame.axis == axis and frame.period_px == finest
+        return replace(frame, period_px=period_px) if own else frame
+
+    return replace(sequence, frames=tuple(map(scale, sequence.frames)))
 
 
 def change_conventions(sequence: PatternSequence, axis: Axis, **values: float) -> PatternSequence:

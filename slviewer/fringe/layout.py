@@ -8,12 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
+from slviewer.fringe.plateau import find_plateau
 from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 
 WHITE_LEVELS = (255, 1023, 4095, 16383, 65535)
 """Full scale of the cameras whose grey levels arrive as uint16."""
 LEFT_ALIGNED_WHITE = (65472, 65520, 65532)
 """Full scale of 10, 12 and 14 bits that fill a uint16 from its top."""
+SAMPLED_ROWS, SAMPLED_PIXELS = 24, 4000
+"""Of the phase steps, in which a plateau below full scale is searched."""
+PREVIEWED = 400
+"""Rows and columns of a single image in which it is searched."""
 SAME_WIDTH = 1e-6
 """Relative difference up to which a Gray cell is a fringe period: over a thousand cells they part
 by a hundredth px."""
@@ -147,7 +152,7 @@ def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
 
 def white_level(sequence: PatternSequence, stack: np.ndarray, indices: Sequence[int]) -> float:
     """Return the grey level at which the camera clips: `clip_level` of these frames of a capture
-    (n, h, w).
+    (n, h, w), or the level below it at which its phase steps show a plateau.
 
     Raises InputError for frames that contradict the full scale that the sequence states.
     """
@@ -163,7 +168,37 @@ def white_level(sequence: PatternSequence, stack: np.ndarray, indices: Sequence[
             f" {largest}: correct it in the description of the images or in the driver of the"
             " camera, then import or capture again"
         )
-    return clip_level(stack.dtype, largest, stated)
+    full_scale = clip_level(stack.dtype, largest, stated)
+    steps = sample_phase_steps(sequence, stack)
+    return find_plateau(steps, full_scale) or full_scale
+
+
+def lowest_white(sequence: PatternSequence, samples: Sequence[np.ndarray]) -> int | None:
+    """Return the level at which the camera clips by the `sample_phase_steps` of a capture's
+    exposures: the lowest plateau below full scale, else the stated full scale."""
+    largest = max(int(steps.max(initial=0)) for steps in samples)
+    full_scale = clip_level(samples[0].dtype, largest, sequence.full_scale)
+    found = [find_plateau(steps, full_scale) for steps in samples]
+    plateaus = [int(level) for level in found if level]
+    return min(plateaus, default=sequence.full_scale)
+
+
+def sample_phase_steps(sequence: PatternSequence, frames: np.ndarray) -> np.ndarray:
+    """Return the levels (k, p) of evenly spread pixels in the k phase steps of frames (n, h, w)."""
+    steps = [i for i, frame in enumerate(sequence.frames) if frame.kind == "phase"]
+    height, width = frames[0].shape
+    rows = np.unique(np.linspace(0, height - 1, min(SAMPLED_ROWS, height)).astype(int))
+    every = max(1, len(rows) * width // SAMPLED_PIXELS)
+    samples = [frames[i][rows, ::every].ravel() for i in steps]
+    return np.stack(samples) if samples else np.zeros((0, 0), frames[0].dtype)
+
+
+def image_white(image: np.ndarray, full_scale: int | None = None) -> float:
+    """Return the grey level at which the camera clips by one image (h, w) alone; ``full_scale`` as
+    in `clip_level`."""
+    clipped = clip_level(image.dtype, int(image.max(initial=0)), full_scale)
+    rows, columns = (max(1, size // PREVIEWED) for size in image.shape)
+    return find_plateau(image[::rows, ::columns].reshape(1, -1), clipped) or clipped
 
 
 def clip_level(dtype: np.dtype, largest: int, full_scale: float | None = None) -> float:

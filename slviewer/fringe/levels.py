@@ -27,6 +27,9 @@ period."""
 SAME_RANGE = 1 - 5e-4
 """Part of a length that a period must have to cover it: periods rounded to a hundred thousandth
 change the beat of two that differ by a fiftieth so much."""
+WIDEST_CELL = 1.25
+"""Gray cell, in longest periods, up to which most of its pixels have a phase of their own; those
+at its ends, where the phase repeats, are masked."""
 LONGEST_BEAT_PX = 1e6
 """Beats of equal frequencies come out longer, by rounding."""
 
@@ -44,6 +47,8 @@ def layout_levels(layout: Layout) -> tuple[Level, ...]:
         try:
             return plan_levels(periods, cell)
         except InputError as error:
+            if cell <= WIDEST_CELL * periods[0]:
+                return plan_levels(periods, periods[0])
             raise InputError(
                 f"{where}{error}, which a Gray cell spans: set gray_cell_px if the cells are"
                 f" narrower, or add Gray bits or the steps of a period of {cell:g} px or more"
@@ -84,9 +89,10 @@ def cell_misfit(layout: Layout) -> float:
     of its Gray cell.
 
     Half way between half a cell, where the cell ends, and half a period, where the next order
-    begins.
+    begins. In a cell wider than a period, where the phase of its other end begins.
     """
-    return 0.25 * (1 + code_cell_px(layout) / layout_levels(layout)[0].period_px)
+    half = 0.5 * code_cell_px(layout) / layout_levels(layout)[0].period_px
+    return min(0.25 + 0.5 * half, 1 - half)
 
 
 @lru_cache(64)

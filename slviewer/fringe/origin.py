@@ -1,6 +1,6 @@
 """Phase at which a Gray code begins, from the phases at its edges."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,9 +75,12 @@ def estimate_gray_origin(
             " begins"
         )
     if found.rising < 1 - MIN_RISING:
+        other = replace(layout, sign=-layout.sign)
+        is_sign = measure_code_origin(other, stack, white).rising >= 1 - MIN_RISING
+        sign = f"set phase_sign to {other.sign}, or " if is_sign else ""
         raise InputError(
-            f"axis {axis}: the code falls where the phase rises: set phase_sign to"
-            f" {-sequence.sign(axis)}, or correct the order of the steps"
+            f"axis {axis}: the code falls where the phase rises: {sign}correct the order of the"
+            " steps"
         )
     if not np.isfinite(found.turns):
         raise InputError(

@@ -175,9 +175,11 @@ def loss_warnings(
         (float(np.mean(each == Reason.SATURATED)) for each in reasons if each.size), default=0.0
     )
     if saturated > MANY_SATURATED:
+        white = white_level(sequence, frames, range(len(frames)))
         messages.append(
             f"{100 * saturated:.0f} % of the illuminated pixels are saturated and masked: lower the"
-            " exposure or the gain until white stays below the camera's full scale"
+            f" exposure or the gain until white stays below grey level {white:.0f}, where the"
+            " camera clips"
         )
     for axis, phase in phases.items():
         if not (phase.steps and phase.mask.any()):

@@ -15,6 +15,7 @@ from slviewer.devices.protocols import CameraSettings, Rig, find_full_scale, rep
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.layout import Layout, axis_layout
 from slviewer.fringe.limits import DARK_LEVELS
+from slviewer.fringe.plateau import find_plateau
 from slviewer.fringe.reference import dark_sigmas, phase_shift
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress, ignore_progress
@@ -161,7 +162,7 @@ class _Bracket:
         self._sigmas = dark_sigmas(layout)
         width, height = rig.camera.size
         self._frame = np.empty((height, width), rig.camera.dtype)
-        self._largest = 0
+        self._largest, self._plateau = 0, math.inf
         self._stride = max(1, math.ceil(math.sqrt(width * height / _PIXELS)))
         x, y, across, down = self.region or (0, 0, width, height)
         if not (0 <= x < width and 0 <= y < height and across > 0 and down > 0):
@@ -242,7 +243,7 @@ class _Bracket:
     @property
     def _full(self) -> float:
         """Grey level at which the camera clips."""
-        return find_full_scale(self.rig.camera, self._largest)
+        return min(self._plateau, find_full_scale(self.rig.camera, self._largest))
 
     @property
     def _clip(self) -> float:
@@ -283,6 +284,8 @@ class _Bracket:
         n = len(self._indices)
         if self._is_fringe:
             _, modulation, background, peak = phase_shift(stack, tuple(range(n)), 1)
+            steps = stack[:n].reshape(n, -1).astype(self._frame.dtype)
+            self._plateau = find_plateau(steps, self._full) or self._plateau
         else:
             modulation, background = abs(stack[0] - stack[1]) / 2, stack[:2].mean(0)
             peak = stack[:2].max(0)

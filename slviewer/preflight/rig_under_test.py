@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.devices.protocols import Rig, find_full_scale, report_driver_faults
+from slviewer.fringe.layout import image_white
 
 _PIXELS = 150_000
 """So many pixels of an image are looked at."""
@@ -133,7 +134,9 @@ class RigUnderTest:
     @property
     def full(self) -> float:
         """The grey level at which the camera clips."""
-        return find_full_scale(self.rig.camera, int(max(self.white.max(), self.dark.max())))
+        stated = find_full_scale(self.rig.camera, int(max(self.white.max(), self.dark.max())))
+        image = np.rint(self.white[::4, ::4]).astype(self.rig.camera.dtype)
+        return image_white(image, int(stated))
 
     @property
     def contrast(self) -> float:

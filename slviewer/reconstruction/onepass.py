@@ -152,8 +152,8 @@ class OnePass:
             multiple=kernels.ROWS,
         )
         # a camera may turn out to have more bits than it seemed
-        if deep and self._clips_higher(scan, int(peaks.max())):
-            return self.sweep(frames, self.light(frames), scan)
+        if deep and (higher := self._raise_white(frames, scan, int(peaks.max()))):
+            return self.sweep(frames, higher, scan)
         return scan
 
     def repair_spikes(self, scan: PassResult) -> None:
@@ -175,9 +175,14 @@ class OnePass:
         check_stack(self.sequence, frames)
         check_map(self.shape[::-1], frames[0], "grey levels")
 
-    def _clips_higher(self, scan: PassResult, peak: int) -> bool:
-        """Whether a largest grey level shows that the camera clips above the light's white."""
-        return clip_level(scan.texture.dtype, peak, self.sequence.full_scale) > scan.light.white
+    def _raise_white(self, frames: np.ndarray, scan: PassResult, peak: int) -> LightLevels | None:
+        """Return the light of frames whose largest grey level shows that the camera clips above the
+        white of the scan's; None where it does not."""
+        white = scan.light.white
+        if peak <= white or clip_level(frames.dtype, peak, self.sequence.full_scale) <= white:
+            return None
+        light = self.light(frames)
+        return light if light.white > white else None
 
     def _begun(
         self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None

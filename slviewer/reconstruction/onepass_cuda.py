@@ -92,8 +92,8 @@ class CudaPass(OnePass):
         if self.texture >= 0:  # the device has no use for it
             np.copyto(scan.texture, frames[self.texture])
         # a camera of more bits than it seemed
-        if self._clips_higher(scan, card.fetch(scan)):
-            return self._run_on_device(frames, replace(scan, light=self.light(frames)))
+        if higher := self._raise_white(frames, scan, card.fetch(scan)):
+            return self._run_on_device(frames, replace(scan, light=higher))
         return scan
 
     def _run_on_processor(

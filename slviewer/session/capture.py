@@ -13,6 +13,7 @@ import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
+from slviewer.fringe.layout import lowest_white, sample_phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json, write_bytes
@@ -228,7 +229,9 @@ class NewCapture:
         if not self.exposures_ms:
             return self.frames
         stacks = np.split(self.frames, len(self.exposures_ms))
-        return merge_exposures(stacks, self.exposures_ms, self.sequence.full_scale)[0]
+        samples = [sample_phase_steps(self.sequence, stack) for stack in stacks]
+        white = lowest_white(self.sequence, samples)
+        return merge_exposures(stacks, self.exposures_ms, white)[0]
 
     def check(self) -> None:
         """Raise InputError unless frames, exposures and texture fit the sequence and one
@@ -366,13 +369,12 @@ def _choose_exposures(
     """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its
     content."""
     n, stored = len(sequence.frames), FrameStack.open(folder / "frames.zarr")
-    highest = np.stack(
-        [
-            peaks(stored.read([index])[0] for index in range(e * n, (e + 1) * n))
-            for e in range(len(exposures_ms))
-        ]
-    )
-    choice = choose_exposure(highest, exposures_ms, sequence.full_scale)
+    highest, samples = [], []
+    for e in range(len(exposures_ms)):
+        stack = stored.read(range(e * n, (e + 1) * n))
+        highest.append(peaks(stack))
+        samples.append(sample_phase_steps(sequence, stack))
+    choice = choose_exposure(np.stack(highest), exposures_ms, lowest_white(sequence, samples))
     _require_unchanged(folder, content_hash)
     choice.flags.writeable = False
     return choice

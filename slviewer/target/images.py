@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
+from slviewer.fringe.layout import image_white
 from slviewer.geometry.rigid import Floats, Floats32
 
 SEARCH_PX = 1600
@@ -49,7 +50,7 @@ class BoardImage:
 def light_advice(grey: NDArray[np.uint8]) -> str:
     """Return advice on exposure and board position for an error message, by the share of saturated
     pixels."""
-    saturated = np.mean(grey[::4, ::4] == 255)
+    saturated = np.mean(grey[::4, ::4] >= image_white(grey))
     advice = "move the board so that all of it is in view, evenly illuminated and in focus"
     if saturated > 0.02:
         return f"lower the exposure ({saturated:.0%} of the image is saturated), or {advice}"

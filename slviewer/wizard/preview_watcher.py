@@ -14,7 +14,7 @@ import numpy as np
 
 from slviewer.calibration.next_pose import approximate_pose
 from slviewer.errors import DetectionError
-from slviewer.fringe.layout import clip_level, to_eight_bits
+from slviewer.fringe.layout import image_white, to_eight_bits
 from slviewer.geometry.lens import Lens
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
@@ -77,6 +77,7 @@ class Watcher:
         now = time.monotonic()
         frame, full_scale = item
         image, scale = reduced(frame, full_scale=full_scale)
+        white = image_white(frame, full_scale)
         if self.watch.board:
             self._detector.offer((image, scale, now))
         if self._last:
@@ -87,7 +88,9 @@ class Watcher:
         if watch.board != self.watch.board:
             board, missing = None, ""
         rate = round(self._rate, 1)
-        light = brightness(frame, full_scale)
+        light = brightness(frame, int(white))
+        level = to_eight_bits(np.array([[white]], frame.dtype), full_scale, int(frame.max()))
+        image = np.where(image < level, image, np.uint8(255))
         self._analysed(PreviewView(self._number, image, scale, *light, board, missing, None, rate))
 
     def _detect(self, item: tuple[np.ndarray, float, float]) -> None:
@@ -166,11 +169,12 @@ def reduced(
 def brightness(frame: np.ndarray, full_scale: int | None = None) -> tuple[float, float, np.ndarray]:
     """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,)
     of shares)."""
-    top = clip_level(frame.dtype, int(frame.max(initial=0)), full_scale)
+    white = image_white(frame, full_scale)
     some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
+    some = np.minimum(some, int(white))
     brightest = float(np.percentile(some, 99.5, method="inverted_cdf"))
-    shares = np.histogram(some, BINS, (0, top + 1))[0] / some.size
-    return float(np.mean(some >= int(top))), brightest / top, shares
+    shares = np.histogram(some, BINS, (0, white + 1))[0] / some.size
+    return float(np.mean(some >= int(white))), brightest / white, shares
 
 
 def detect_in_preview(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:
