@@ -3,12 +3,18 @@ several."""
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig, report_driver_faults
+from slviewer.devices.protocols import (
+    CameraSettings,
+    ColourCamera,
+    Rig,
+    read_lens,
+    report_driver_faults,
+)
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.sequence import PatternSequence
 
@@ -84,7 +90,8 @@ def _capture_loaded(
 class CapturedFrames:
     """Result of `capture_with_texture`: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the
     whole sequence in one after the other; the camera's settings; the sequence and the name of the
-    rig; and a colour texture (h, w, 3), None with a monochrome camera.
+    rig; a colour texture (h, w, 3), None with a monochrome camera; and what the camera reports of
+    its ``lens``, as `read_lens`.
     """
 
     frames: np.ndarray
@@ -93,6 +100,7 @@ class CapturedFrames:
     source: str
     exposures_ms: tuple[float, ...] = ()
     texture: np.ndarray | None = None
+    lens: Mapping[str, float] = field(default_factory=dict)
 
 
 def capture_with_texture(
@@ -141,12 +149,14 @@ def _complete(
 ) -> CapturedFrames:
     """Return captured frames with the camera's settings and the colour texture (h, w, 3), None also
     on a DeviceError: the frames are complete without it."""
-    texture = None
+    texture, lens = None, dict[str, float]()
     with report_driver_faults(rig.camera):
         settings = rig.camera.settings()
         with contextlib.suppress(DeviceError):
             texture = capture_colour(rig)
-    return CapturedFrames(frames, settings, sequence, rig.name, applied_ms, texture)
+    with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):
+        lens = read_lens(rig.camera)
+    return CapturedFrames(frames, settings, sequence, rig.name, applied_ms, texture, lens)
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:

@@ -38,6 +38,12 @@ Trigger = Literal["software", "hardware", "free"]
 _IMPLEMENTED, _READABLE, _WRITABLE = ((1, 2, 3, 4), (3, 4), (2, 4))
 _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")  # the second is older GigE cameras'
 _MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "s": 1e3}
+_LENS = {
+    "focus": ("FocusStepper", "Focus", "FocalPower"),
+    "zoom": ("Zoom", "FocalLength"),
+    "aperture": ("ApertureStepper", "Iris", "Aperture"),
+}
+"""Features of the optics, by rising precedence."""
 _AUTOMATIC = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto", "BlackLevelAuto")
 _ALTERING = (
     "AcquisitionFrameRateEnable",
@@ -173,6 +179,17 @@ class Features:
                 None if exposure is None else float(exposure.value) * _ms_per_unit(exposure),
                 None if gain is None else 10 ** (float(gain.value) / 20),
             )
+
+    def read_lens(self) -> dict[str, float]:
+        """Read the focus, zoom and aperture that a camera with a motorised or a liquid lens has."""
+        with as_device_error(self._name):
+            found = {
+                what: node
+                for what, names in _LENS.items()
+                for name in names
+                if (node := self._get_node(name)) is not None
+            }
+            return {what: float(node.value) for what, node in found.items()}
 
     def apply(self, settings: CameraSettings) -> None:
         """Set the nearest supported values of the settings that the camera has."""
@@ -361,6 +378,9 @@ class GenicamCamera(CameraDriver):
 
     def _read_settings(self) -> CameraSettings:
         return self._get_features().settings()
+
+    def _read_lens(self) -> dict[str, float]:
+        return self._get_features().read_lens()
 
     def _write_settings(self, settings: CameraSettings) -> None:
         """Set them, and wait longer for frames of longer exposures."""

@@ -36,6 +36,11 @@ from slviewer.errors import DeviceError, InputError
 
 UNKNOWN = -1.0
 """What OpenCV says for a control that it does not know (`getProperty` of every backend)."""
+_LENS = {
+    "focus": cv2.CAP_PROP_FOCUS,
+    "zoom": cv2.CAP_PROP_ZOOM,
+    "aperture": cv2.CAP_PROP_IRIS,
+}
 
 
 @dataclass(frozen=True)
@@ -398,6 +403,15 @@ class OpenCVCamera(CameraDriver):
         return CameraSettings(
             None if dialect is None else reader.do(lambda capture: exposure_ms(capture, dialect))
         )
+
+    def _read_lens(self) -> dict[str, float]:
+        """Return those of `_LENS` that the camera reports; none of a stream or a video."""
+        if self._dialect is None:
+            return {}
+        values = self._require_reader().do(
+            lambda capture: {name: capture.get(control) for name, control in _LENS.items()}
+        )
+        return {name: value for name, value in values.items() if value != UNKNOWN}
 
     def _write_settings(self, settings: CameraSettings) -> None:
         """Set the exposure; what could not be set is in `notes`."""

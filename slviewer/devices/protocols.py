@@ -45,7 +45,7 @@ class Camera(Protocol):
     One of more than 8 bits may also have a `full_scale`, the grey level at which it clips, such as
     4095. It can be read before the camera is open, and is stored with its captures; without it the
     bit depth is taken from the brightest pixel, and a dark image may pass for a bright one of fewer
-    bits.
+    bits. One that knows its focus, zoom or aperture may also have `read_lens`, as `CameraDriver`.
     """
 
     @property
@@ -114,6 +114,12 @@ def list_changed_settings(
         and abs(in_effect - value) > _SETTING_TOLERANCE * value
         and not any(f"{value:g}{unit}" in note for note in list_notes(camera))
     )
+
+
+def read_lens(camera: Camera) -> dict[str, float]:
+    """Return what a camera reports of its "focus", "zoom" and "aperture", in its own units."""
+    read = getattr(camera, "read_lens", dict)
+    return {name: float(value) for name, value in read().items()}
 
 
 def find_full_scale(camera: Camera, largest: int) -> float:
@@ -355,6 +361,12 @@ class CameraDriver(Openable):
         self.check_open()
         return self._read_settings()
 
+    def read_lens(self) -> dict[str, float]:
+        """Read "focus", "zoom" and "aperture" from the device, those that it reports, in its own
+        units."""
+        self.check_open()
+        return self._read_lens()
+
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Set the nearest values that the camera has, and return those in effect."""
         self.check_open()
@@ -366,6 +378,9 @@ class CameraDriver(Openable):
 
     def _read_settings(self) -> CameraSettings:
         return CameraSettings()
+
+    def _read_lens(self) -> dict[str, float]:
+        return {}
 
     def _write_settings(self, settings: CameraSettings) -> None:
         pass

@@ -72,6 +72,10 @@ class SimulatedCamera(CameraDriver):
     def _read_settings(self) -> CameraSettings:
         return self._settings
 
+    def _read_lens(self) -> dict[str, float]:
+        """Return the focal length as the focus: px of the camera at full resolution."""
+        return {"focus": self.world.rig.camera.focal_px[0]}
+
     def _write_settings(self, settings: CameraSettings) -> None:
         """Set exposure and gain, limited to 0.01 ... 100 ms and 1 ... 16 times."""
         before = self._settings

@@ -28,7 +28,8 @@ from slviewer.geometry.shapes import (
     ransac_plane,
     ransac_sphere,
 )
-from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
+from slviewer.geometry.vectors import finite_rows, patch_means, rms, subsample, unit_vectors
+from slviewer.reconstruction.axis_agreement import RAISED_RATIO
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.record import to_vector
 from slviewer.records.verification import MAX_EXCLUDED, ModelFit, Shape, Verification
@@ -411,7 +412,8 @@ class Comparison:
     region's illuminated pixels that it measures, NaN where these are not known. ``incidence``:
     percent of the measured region in R1, R2, R3, or None without a depth range. ``share``: of the
     pixels that all models measure, those in the region; ``is_searched``: the region was not given,
-    it is the largest patch of the shape.
+    it is the largest patch of the shape. ``misfit_ratio``: the least of models that know
+    their errors, of the residuals in the mean of patches over what noise and calibration predict.
     """
 
     shape: Shape
@@ -422,11 +424,12 @@ class Comparison:
     incidence: dict[str, float] | None
     share: float = 1.0
     is_searched: bool = False
+    misfit_ratio: float = 0.0
 
     @property
     def warnings(self) -> list[str]:
         """Warnings where more than 2 % of the points were excluded, where a plane is a minor part
-        of the scene, and where the RMS is far above the noise floor by every model."""
+        of the scene, and where residuals are far above what is predicted by every model."""
         messages = [
             f"{model}: {result.warning}" for model, result in self.results.items() if result.warning
         ]
@@ -446,6 +449,12 @@ class Comparison:
             messages.append(
                 f"the RMS is {known[best]:.1f} times the noise floor at best ({best}): this is no"
                 f" {self.shape}, the frames are disturbed, or the calibration is off by that much"
+            )
+        elif self.misfit_ratio > RAISED_RATIO:
+            messages.append(
+                f"residuals in the mean of patches are {self.misfit_ratio:.1f} times what is"
+                f" predicted: the {self.shape} has form errors, or focus, zoom, aperture or a"
+                " device has changed since the calibration: run `slviewer check`"
             )
         return messages
 
@@ -484,6 +493,7 @@ class Comparison:
             incidence=self.incidence,
             share=finite_or_none(self.share),
             region_px=self._region_px(),
+            warnings=tuple(self.warnings),
             **origin,
         )
 
@@ -555,7 +565,21 @@ def fit_clouds(
         incidence=None if depth_range is None else incidence(every, region, depth_range),
         share=int(np.count_nonzero(common)) / max(1, int(np.count_nonzero(shared))),
         is_searched=is_searched,
+        misfit_ratio=_misfit_ratio(results, clouds),
     )
+
+
+def _misfit_ratio(results: Mapping[str, ShapeResult], clouds: Mapping[str, Cloud]) -> float:
+    """Return the ratio as in `Comparison.misfit_ratio`; 0 where no model knows its errors."""
+    ratios = []
+    for model, result in results.items():
+        if (sigma := clouds[model].sigma_calibration) is not None:
+            at = tuple(subsample(np.argwhere(result.inliers), _SAMPLE).T)
+            points = clouds[model].points[at].astype(np.float64)
+            _, means, noise = patch_means(points, result.error_map[at].astype(np.float64))
+            predicted = np.hypot(rms(noise), noise_floor(result.shape, points, sigma[at]))
+            ratios.append(rms(means) / float(predicted))
+    return min(ratios, default=0.0)
 
 
 def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:

@@ -52,6 +52,11 @@ def median_spacing(tree: cKDTree, samples: int) -> float:
     return float(np.median(distance[:, 1]))
 
 
+PATCHES = 8
+"""Across a region: deviations within a patch are taken for one another's company, those of
+different patches not."""
+LEAST_IN_PATCH = 20
+"""Points, below which the mean of a patch says nothing."""
 _BITS = 21  # of each coordinate of a cube
 
 
@@ -76,3 +81,18 @@ def sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndarr
     ``points`` (n, 3)."""
     _, which = occupied_cubes(points, side)
     return np.stack([np.bincount(which, column) for column in values.T], axis=1)
+
+
+def patch_means(
+    points: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the middles (m, 3) of the patches of points (n, 3) mm that hold enough of them, the
+    means (m,) of their ``values`` (n,), and the standard deviations (m,) of these means."""
+    low = points.min(axis=0)
+    side = max(float(np.ptp(points, axis=0).max()) / PATCHES, 1e-12)
+    columns = np.column_stack([np.ones(len(points)), points, values, values**2])
+    sums = sum_by_cube(columns, points - low, side)
+    sums = sums[sums[:, 0] >= LEAST_IN_PATCH]
+    count, means = sums[:, 0], sums[:, 1:] / sums[:, :1]
+    variance = np.maximum(means[:, 4] - means[:, 3] ** 2, 0.0)
+    return means[:, :3], means[:, 3], np.sqrt(variance / (count - 1))

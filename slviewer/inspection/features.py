@@ -218,7 +218,7 @@ def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list
     if KINDS.index(a.kind) > KINDS.index(b.kind):
         a, a_spread, b, b_spread = b, b_spread, a, a_spread
     covariance = joint_covariance(a_spread, b_spread)
-    whole = a_spread.shared is not None and b_spread.shared is not None
+    whole = a_spread.whole and b_spread.whole
     p = a.parameters
 
     def quantity(meaning: Meaning) -> Quantity:

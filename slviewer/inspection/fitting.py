@@ -17,9 +17,19 @@ from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import Floats, Uncertainty, move_points, rigid_transform
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.geometry.shapes import fit_plane, fit_sphere
-from slviewer.geometry.vectors import diagonal, finite_rows, lengths, rms, subsample, unit_vectors
+from slviewer.geometry.vectors import (
+    diagonal,
+    finite_rows,
+    lengths,
+    patch_means,
+    rms,
+    subsample,
+    unit_vectors,
+)
 from slviewer.inspection.features import Feature, Kind, perpendicular_axes
-from slviewer.inspection.uncertainty import Shared, Spread, scatter_covariance
+from slviewer.inspection.uncertainty import PointErrors, Spread, scatter_covariance
+from slviewer.reconstruction.axis_agreement import RAISED_RATIO
+from slviewer.reconstruction.rig_change import bound_change
 from slviewer.records.measurement import Quantity
 from slviewer.records.verification import MAX_EXCLUDED
 
@@ -123,6 +133,7 @@ MAX_FITTED_POINTS = 20_000
 """Points that a fit looks at: more of them change it by less than what it cannot know anyway."""
 MAX_SHARED_POINTS = 400
 MAX_COMPARED_POINTS = 2_000
+NO_ERRORS = PointErrors()
 MAX_EXCLUDED_SHARE = 0.4
 """Share of a region that may lie off the shape; beyond it the region holds something else."""
 MAX_RMS_RISE = 0.005
@@ -167,7 +178,7 @@ class FeatureFit:
         if radius is None:
             return listed
         # of a fit with a radius the last parameter
-        sigma, known = float(self.spread.sigmas[-1]), self.spread.shared is not None
+        sigma, known = float(self.spread.sigmas[-1]), self.spread.whole
         size = [
             Quantity(name, times * radius, "mm", times * sigma, known)
             for name, times in (("radius", 1), ("diameter", 2))
@@ -175,14 +186,13 @@ class FeatureFit:
         return size + listed
 
 
-def fit_feature(
-    kind: Kind, points: np.ndarray, shared: Shared | None = None, calibration: str = ""
-) -> FeatureFit:
+def fit_feature(kind: Kind, points: np.ndarray, errors: PointErrors = NO_ERRORS) -> FeatureFit:
     """The shape of a region's points (n, 3) mm, by least squares of the distances, outliers
     excluded.
 
-    ``shared``: what the calibration leaves uncertain at places, of the ``calibration`` of that name
-    or hash. Raises InputError where the region does not hold the shape.
+    ``errors``: of the points; changes of the rig are part of the uncertainty where the axes of the
+    scan, or the residuals, show more than is predicted. Raises InputError where the region does not
+    hold the shape.
     """
     points = np.asarray(points, np.float64)
     points = points[finite_rows(points)]
@@ -209,14 +219,16 @@ def fit_feature(
         )
     basis = sampled[inliers]
     _refuse_other(kind, feature, basis)
-    spread = _estimate_spread(feature, basis, shared, calibration)
+    spread, warnings = _estimate_spread(feature, basis, errors), list[str]()
+    if found := _find_misfit(feature, basis, errors):
+        warnings.append(found[0])
+        spread = replace(spread, scatter=spread.scatter + found[1])
     sigma = spread.sigmas[-1]
     if feature.radius is not None and not sigma <= MAX_RADIUS_SIGMA * feature.radius:
         raise InputError(
             f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the"
             " region shows too little of its curve; select more of it."
         )
-    warnings = []
     if excluded_share > MAX_EXCLUDED:
         warnings.append(
             f"{100 * excluded_share:.1f} % of the region lie beyond {MAX_SIGMA:g} robust sigma "
@@ -265,21 +277,60 @@ def _fit_cylinder(start: Feature, points: Floats) -> Feature:
     return Feature("cylinder", middle, along, feature.radius)
 
 
-def _estimate_spread(
-    feature: Feature, points: Floats, shared: Shared | None, calibration: str
-) -> Spread:
+def _estimate_spread(feature: Feature, points: Floats, errors: PointErrors) -> Spread:
     """Estimate the covariance of a fitted feature: own scatter, and the errors shared through the
     calibration."""
     J = feature.jacobian(points)
     own = scatter_covariance(points, J, feature.distance(points))
-    if shared is None:
+    if (shared := errors.raised) is None:
         return Spread(own)
     some = subsample(points, MAX_SHARED_POINTS)
     J = feature.jacobian(some)
     # a displacement of the points changes each distance by its part along the normal, and the fit
     # makes up for it
     answers = -np.linalg.pinv(J)[:, :, None] * feature.normals(some)[None]
-    return Spread(own, shared(some, answers), calibration)
+    return Spread(own, shared(some, answers), errors.calibration)
+
+
+def _find_misfit(
+    feature: Feature, points: Floats, errors: PointErrors
+) -> tuple[str, Floats] | None:
+    """Compare the residuals of a fit, in the mean of patches, with what noise and calibration
+    predict; where they are far above, return a warning, and what a change of the rig that would
+    explain them adds to the covariance of the parameters (p, p)."""
+    middles, means, noise = patch_means(points, feature.distance(points))
+    response, shared = errors.response, errors.shared
+    if response is None or not errors.is_predicted or len(means) <= feature.parameters:
+        return None
+    some = subsample(points, MAX_SHARED_POINTS)
+    places = np.vstack([middles, some])
+    normals, J = feature.normals(places), feature.jacobian(places)
+    m = len(middles)
+    # the fit makes up for part of the displacements along the normals, as in `_estimate_spread`
+    answers = np.zeros((feature.parameters, len(places), 3))
+    answers[:, m:] = -np.linalg.pinv(J[m:])[:, :, None] * normals[m:]
+    remaining = np.einsum("mp,pni->mni", J[:m], answers)
+    remaining[np.arange(m), np.arange(m)] += normals[:m]
+    by_px = response.residual_px * np.sum(normals[:m] * response.by_px(middles), axis=1)
+    variance = noise**2 + by_px**2
+    if shared is not None:
+        variance += np.sum(shared(places, remaining) ** 2, axis=0)
+    observed, predicted = rms(means), float(np.sqrt(variance.mean()))
+    if not observed > RAISED_RATIO * predicted:
+        return None
+    by_change = response.by_change(places)
+    effects = np.einsum("mni,nik->mk", remaining, by_change)
+    change = bound_change(effects, means, np.sqrt(variance))
+    added = change[:, None] * np.einsum("pni,nik->kp", answers, by_change)
+    return (
+        f"the {feature.kind} fits {observed / predicted:.0f} times worse than noise and calibration"
+        f" predict: points lie {observed:.2g} mm off it in the mean of patches (predicted"
+        f" {predicted:.2g} mm). Focus, zoom, aperture or a device has changed since the"
+        " calibration, or the part has this form; U allows for both. To tell, check the calibration"
+        " with a new pose of its board (`slviewer check`): where it no longer fits, calibrate"
+        " again; where it does, this is the part's form or light by other paths",
+        added.T @ added,
+    )
 
 
 def _refuse_other(kind: Kind, feature: Feature, points: Floats) -> None:

@@ -24,12 +24,11 @@ from scipy.stats import chi2
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, Uncertainty
 from slviewer.geometry.robust import robust_sigma
-from slviewer.geometry.vectors import finite_rows, subsample, sum_by_cube, unit_vectors
+from slviewer.geometry.vectors import PATCHES, finite_rows, subsample, sum_by_cube, unit_vectors
 from slviewer.inspection.features import Feature, perpendicular_axes
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
 from slviewer.inspection.uncertainty import (
     DRAWS,
-    PATCHES,
     Shared,
     draw_motions,
     draw_steps,
@@ -324,7 +323,7 @@ def position_error(
         return 2 * float(np.abs(place_or_axis.distance(places)).max())
 
     drawn = np.array([off(f.moved(step), shift) for step, shift in zip(steps, shifts, strict=True)])
-    return _correct_for_noise("position", off(f, 0.0), drawn, fit.spread.shared is not None)
+    return _correct_for_noise("position", off(f, 0.0), drawn, fit.spread.whole)
 
 
 def profile_error(
@@ -419,7 +418,7 @@ def _axis_orientation(
     steps = draw_steps(joint_covariance(fit.spread, datum.spread), np.random.default_rng(4))
     p = f.parameters
     drawn = np.array([off(f.moved(step[:p]), d.moved(step[p:])) for step in steps])
-    whole = fit.spread.shared is not None and datum.spread.shared is not None
+    whole = fit.spread.whole and datum.spread.whole
     return _correct_for_noise(kind, off(f, d), drawn, whole)
 
 

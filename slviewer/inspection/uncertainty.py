@@ -2,7 +2,7 @@
 fits share."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,17 +16,14 @@ from slviewer.calibration.splined.uncertainty import (
 )
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import grid_points
-from slviewer.geometry.rigid import Floats, Uncertainty
-from slviewer.geometry.vectors import finite_rows, sum_by_cube
+from slviewer.geometry.rigid import Floats, Uncertainty, move_points
+from slviewer.geometry.vectors import PATCHES, finite_rows, sum_by_cube
+from slviewer.reconstruction.rig_change import PointResponse
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p),
 whose product with itself is the parameters' covariance by errors that no averaging lessens. The k
 of two calls are the same errors."""
-
-PATCHES = 8
-"""Across a region: deviations within a patch are taken for one another's company, those of
-different patches not."""
 
 DRAWS = 200
 """Of errors, where they are propagated by drawing them."""
@@ -48,9 +45,63 @@ class Spread:
         return self.scatter if self.shared is None else self.scatter + self.shared.T @ self.shared
 
     @property
+    def whole(self) -> bool:
+        """Whether the calibration's part is known."""
+        return bool(self.calibration)
+
+    @property
     def sigmas(self) -> Floats:
         """(p,): standard deviations."""
         return np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True, eq=False)
+class PointErrors:
+    """What is known of the errors of a surface's points that their scatter does not show.
+
+    ``shared``: those of the ``calibration`` of that name or hash; ``response``: how the points
+    answer to changes of the rig; both where known.
+    """
+
+    shared: Shared | None = None
+    calibration: str = ""
+    response: PointResponse | None = None
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether it is known by how much shapes miss the points beyond their scatter."""
+        response = self.response
+        return response is not None and (self.shared is not None or response.residual_px > 0)
+
+    @property
+    def raised(self) -> Shared | None:
+        """``shared``, with what a misfit of the scan's axes adds to it."""
+        shared, response = self.shared, self.response
+        if response is None or response.misfit is None:
+            return shared
+        if shared is None:
+            return response.raised
+        return lambda points, answers: np.vstack(
+            [shared(points, answers), response.raised(points, answers)]
+        )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the scan's axes contradict in the calibration, in a sentence."""
+        misfit = None if self.response is None else self.response.misfit
+        return () if misfit is None else (misfit.text(),)
+
+    def moved(self, T: Floats) -> "PointErrors":
+        """Return the errors of the points moved by ``T`` (4, 4)."""
+        shared, back = self.shared, np.linalg.inv(T).astype(np.float64)
+
+        def moved(points: np.ndarray, answers: np.ndarray) -> np.ndarray:
+            """Return ``shared`` of moved points and displacements."""
+            assert shared is not None
+            return shared(move_points(back, points), answers @ T[:3, :3])
+
+        response = None if self.response is None else replace(self.response, T=T @ self.response.T)
+        return replace(self, shared=None if shared is None else moved, response=response)
 
 
 def draw_motions(motion: Uncertainty, rng: np.random.Generator) -> Callable[[Floats], Floats]:
@@ -67,7 +118,8 @@ def joint_covariance(a: Spread, b: Spread) -> Floats:
     whole = np.zeros((p + len(b.scatter),) * 2)
     whole[:p, :p], whole[p:, p:] = a.covariance, b.covariance
     if a.shared is not None and b.shared is not None and a.calibration == b.calibration:
-        whole[:p, p:] = a.shared.T @ b.shared
+        k = min(len(a.shared), len(b.shared))  # what a misfit adds to one of them comes last
+        whole[:p, p:] = a.shared[:k].T @ b.shared[:k]
         whole[p:, :p] = whole[:p, p:].T
     return whole
 
@@ -120,9 +172,10 @@ def splined_shared(
 ) -> Shared:
     """Return the function for the uncertainty that a splined calibration causes in points measured
     through one axis, without the rigid motion of the working volume, so that distances and angles
-    are not affected by it. ``scale``: by what factor the points were enlarged after their
-    reconstruction, and ``scale_sigma`` the standard uncertainty of that factor."""
-    rig = bundle.state.rig
+    are not affected by it; raised where the calibration's residuals exceed their noise.
+    ``scale``: by what factor the points were enlarged after their reconstruction, and
+    ``scale_sigma`` the standard uncertainty of that factor."""
+    rig, raised = bundle.state.rig, bundle.noise.ratio["xy".index(axis)]
     reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
     motion = BestMotion.fit(reference.points)
     moved = motion.weights.T @ bundle.point_jacobian(axis, reference.pixels, reference.z).toarray()
@@ -135,7 +188,7 @@ def splined_shared(
         jacobian = bundle.point_jacobian(axis, pixels, places[:, 2])
         jacobian.data[~np.isfinite(jacobian.data)] = 0.0
         volume = Volume(pixels, places[:, 2], *view_pixels(rig, pixels, places[:, 2]))
-        weights = scale * extrapolation_factor(bundle, volume)
+        weights = scale * raised * extrapolation_factor(bundle, volume)
         weighed = (answers * weights[:, None]).reshape(len(answers), -1)
         free = weighed @ jacobian - (weighed @ motion.displace(places)) @ moved
         larger = np.einsum("pni,ni->p", answers, scale_sigma * (places - motion.centre))

@@ -268,6 +268,7 @@ def save_frames(
     """Save captured frames with their sequence, settings and texture; returns the stored
     capture."""
     turned = {} if turn_step is None else {"turntable": to_plain(turn_step)}
+    lens = {"lens": captured.lens} if captured.lens else {}
     exposure = {} if captured.exposures_ms else {"exposure_ms": captured.settings.exposure_ms}
     return store.save_capture(
         name,
@@ -276,7 +277,7 @@ def save_frames(
         captured.frames,
         source=captured.source,
         texture=captured.texture,
-        settings={"purpose": purpose, **exposure, "gain": captured.settings.gain, **turned},
+        settings={"purpose": purpose, **exposure, "gain": captured.settings.gain, **lens, **turned},
         board=board,
         exposures_ms=captured.exposures_ms,
         force=force,

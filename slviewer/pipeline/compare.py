@@ -130,6 +130,7 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         **provenance(on),
         quantities=described.quantities(),
         deviation=described,
+        warnings=on.errors.warnings,
     )
     job.progress(0.92, "writing")
     compared = (settings.scan, Path(nominal.name).stem)

@@ -26,7 +26,7 @@ from slviewer.inspection.fitting import (
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
-from slviewer.inspection.uncertainty import Shared
+from slviewer.inspection.uncertainty import PointErrors
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
@@ -344,18 +344,18 @@ class AlignedPart:
         within = self.features[name].region.within(self.points)
         away, towards = self._nominal_surface.signed(self.points[within])
         away[np.abs(away) > self._reach] = np.nan
-        return profile_error(self.points[within], away, towards, self.spread, self.shared)
+        return profile_error(self.points[within], away, towards, self.spread, self.errors.raised)
+
+    def doubts(self, names: Sequence[str]) -> list[str]:
+        """Return the warnings about the scan and the fits of features."""
+        fitted = [name for name in names if self.features[name].kind != "surface"]
+        found = [warning for name in fitted for warning in self.feature(name).warnings]
+        return [*self.errors.warnings, *dict.fromkeys(found)]
 
     @property
-    def shared(self) -> Shared | None:
-        """The calibration's part of uncertainties, for places and displacements in part
-        coordinates."""
-        if (shared := self._surface.shared) is None:
-            return None
-        T_part_scan, T_scan_part = self.T_part_scan, np.linalg.inv(self.T_part_scan)
-        return lambda points, answers: shared(
-            move_points(T_scan_part, points), answers @ T_part_scan[:3, :3]
-        )
+    def errors(self) -> PointErrors:
+        """Errors of the points in part coordinates."""
+        return self._surface.errors.moved(self.T_part_scan)
 
     def _align_datums(self, datums: Sequence[str]) -> None:
         """Align by three datums, whose regions follow the part."""
@@ -382,7 +382,7 @@ class AlignedPart:
         points = move_points(T, self._scan_points)
         within = feature.region.within(points)
         try:
-            fit = fit_feature(feature.kind, points[within], self.shared, self._surface.calibration)
+            fit = fit_feature(feature.kind, points[within], self.errors)
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
         towards = T[:3, 3] - fit.feature.place
@@ -423,7 +423,9 @@ def _measure(wanted: Characteristic, part: AlignedPart) -> CharacteristicResult:
     if U is None or not np.isfinite(value + U):
         return _undecided(wanted, "its uncertainty is not known")
     decision = judge_limits(value, U, wanted.lower, wanted.upper)
-    return CharacteristicResult(wanted.name, value, U, decision, whole=quantity.whole)
+    doubts = "; ".join(part.doubts(wanted.features))
+    whole = quantity.whole and bool(part.errors.calibration)
+    return CharacteristicResult(wanted.name, value, U, decision, doubts, whole)
 
 
 def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantity:
@@ -434,7 +436,7 @@ def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantit
     fit, planned = part.feature(name), part.features[name]
     points = part.points[planned.region.within(part.points)]
     if kind in FORMS:
-        return form_error(kind, fit, points, part.shared)  # type: ignore[arg-type]
+        return form_error(kind, fit, points, part.errors.raised)  # type: ignore[arg-type]
     if kind == "position":
         return position_error(fit, points, planned.nominal(), part.spread)
     if kind in SIZES:
@@ -442,7 +444,7 @@ def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantit
     else:
         datum = part.feature(others[0])
         if kind in TO_DATUM:
-            return orientation_error(kind, fit, points, datum, part.shared)  # type: ignore[arg-type]
+            return orientation_error(kind, fit, points, datum, part.errors.raised)  # type: ignore[arg-type]
         quantities = relation(fit.feature, fit.spread, datum.feature, datum.spread)
     named = {quantity.name: quantity for quantity in quantities}
     if kind in named:

@@ -12,10 +12,10 @@ import numpy as np
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError, UsageError
 from slviewer.inspection.features import KINDS, Feature, distance, relation
-from slviewer.inspection.fitting import fit_feature
+from slviewer.inspection.fitting import NO_ERRORS, fit_feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane, section, triangulate_near
-from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
+from slviewer.inspection.uncertainty import PointErrors, Spread, splined_shared
 from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
@@ -23,6 +23,7 @@ from slviewer.pipeline.models import (
     available_models,
     check_accepted,
     load_model,
+    load_stereo,
     preferred_model,
     warn_if_stale,
 )
@@ -40,6 +41,7 @@ from slviewer.pipeline.stored_records import (
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals, triangulate_grid
+from slviewer.reconstruction.rig_change import PointResponse
 from slviewer.records.measurement import (
     MeasuredFeature,
     MeasuredRegion,
@@ -57,7 +59,7 @@ from slviewer.session.store import Session
 What = Literal["point", "distance", "section", "plane", "sphere", "cylinder"]
 FITTED = ("plane", "sphere", "cylinder")
 MAX_RMS_TO_NOISE = 5.0
-"""Times the points' noise: a fit with a larger RMS gets a warning."""
+"""Times the points' noise: a larger RMS gets a warning where nothing else is known."""
 Measured = tuple[dict[str, Any], dict[str, np.ndarray]]
 """Fields of a measurement, and its arrays."""
 COLUMNS = (
@@ -77,10 +79,10 @@ class MeasuredSurface:
     measured.
 
     ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along
-    ``normals`` for a merged surface; ``left_mm`` likewise: standard deviation from the calibration,
-    where known. ``faces`` (m, 3): of a merged mesh. ``source`` is the capture or result that it
-    came from, ``model`` the calibration, ``inputs`` the hashes of both; ``shared``: the covariance
-    of errors of that ``calibration``, by its hash, where known.
+    ``normals`` for a merged surface; ``left_mm`` likewise: standard deviation from the calibration
+    and a misfit of the axes, where known. ``faces`` (m, 3): of a merged mesh. ``source`` is the
+    capture or result that it came from, ``model`` the calibration, ``inputs`` the hashes of both;
+    ``errors``: those that the points share, where known, by the hash of the calibration.
     """
 
     points: np.ndarray
@@ -91,8 +93,7 @@ class MeasuredSurface:
     left_mm: np.ndarray | None = None
     normals: np.ndarray | None = None
     faces: np.ndarray | None = None
-    shared: Shared | None = None
-    calibration: str = ""
+    errors: PointErrors = NO_ERRORS
     texture: np.ndarray | None = None
     scale: float = 1.0
 
@@ -133,8 +134,9 @@ class MeasuredSurface:
             away = sigma * point / point[2]
         elif self.normals is not None:
             away = sigma * np.asarray(self.normals[index], np.float64)
-        shared = None if self.shared is None else self.shared(point[None], np.eye(3)[:, None])
-        return Feature("point", point), Spread(np.outer(away, away), shared, self.calibration)
+        raised, own = self.errors.raised, np.outer(away, away)
+        shared = None if raised is None else raised(point[None], np.eye(3)[:, None])
+        return Feature("point", point), Spread(own, shared, self.errors.calibration)
 
     def sigma_along(self, normals: np.ndarray, whole: bool = False) -> np.ndarray:
         """(n,) mm: standard deviation of the measured points along unit normals (n, 3), of noise
@@ -200,19 +202,19 @@ def surface_from_cloud(
         names.append(f"scale/{fitted.name}")
         scale, sigma = float(applied["factor"]), 1e-6 * float(applied["U_ppm"]) / 2
     inputs = store.input_hashes(*names) | restriction_inputs(store, [scan], with_region=with_region)
-    shared = None
+    shared, rig = None, fitted if isinstance(fitted, SplinedModel) else load_stereo(store)
     if isinstance(fitted, SplinedModel):
         shared = splined_shared(fitted.bundle, cloud.axis, scale, sigma)
+    response = PointResponse.from_cloud(cloud, rig.pinholes, rig.residual_px, scale)
     return MeasuredSurface(
         cloud.points,
         cloud.sigma_z,
         scan,
         fitted.name,
         inputs,
-        left_mm=cloud.sigma_calibration,
+        left_mm=cloud.sigma_calibration if cloud.misfit is None else cloud.sigma_systematic,
         normals=normals(cloud.points),
-        shared=shared,
-        calibration="" if shared is None else inputs[calibration],
+        errors=PointErrors(shared, "" if shared is None else inputs[calibration], response),
         texture=cloud.texture,
         scale=scale,
     )
@@ -327,6 +329,7 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
     )
     makers = {"point": _pick, "distance": _measure_distance, "section": _cut}
     fields, arrays = makers.get(settings.what, _fit)(on, settings)
+    fields["warnings"] = (*on.errors.warnings, *fields.get("warnings", ()))
     record = Measurement(
         what=settings.what, name=clean_label(settings.name), **provenance(on), **fields
     )
@@ -381,9 +384,10 @@ def _measure_distance(on: MeasuredSurface, settings: MeasureSettings) -> Measure
 def _fit(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     """A plane, sphere or cylinder fitted to a region. Raises InputError where it has none."""
     region = settings.region()
-    fit = fit_feature(settings.what, on.within(region), on.shared, on.calibration)  # type: ignore[arg-type]
+    kind, points = settings.what, on.within(region)
+    fit = fit_feature(kind, points, on.errors)  # type: ignore[arg-type]
     noise, warnings = on.noise(region), list(fit.warnings)
-    if fit.rms > MAX_RMS_TO_NOISE * noise:
+    if not on.errors.is_predicted and fit.rms > MAX_RMS_TO_NOISE * noise:
         warnings.append(
             f"points lie {fit.rms:.3g} mm (RMS) off the {settings.what}, and their noise is"
             f" {noise:.2g} mm: see what it shows"

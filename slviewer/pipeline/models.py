@@ -25,6 +25,7 @@ from slviewer.pipeline.stored_records import (
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Verdict
+from slviewer.session.capture import Capture
 from slviewer.session.reading import decoding
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -38,6 +39,8 @@ VERDICT = "verdict/1"
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better
 default."""
+LENS_TOLERANCE = 1e-3
+"""Share by which focus, zoom and aperture may differ from those of the calibration's poses."""
 COMPILED = "compiled/splined"
 COMPILED_VERSION = 1
 """Of what `SplinedModel.compile_depth` returns."""
@@ -122,6 +125,26 @@ def load_stereo(store: Session) -> StereoModel:
     return store.decode_result(
         "calibration/stereo", lambda meta, _: _decode_stereo(store, meta), only=()
     )
+
+
+def lens_warnings(store: Session, capture: Capture) -> tuple[str, ...]:
+    """Return a sentence for each of focus, zoom and aperture that the camera reported otherwise
+    than for the calibration's poses."""
+    inputs = store.load_result("calibration/stereo", only=())[0]["inputs"]
+    names = inputs.keys() & set(store.capture_names("calibration")) if capture.lens else ()
+    poses = [pose for name in names if (pose := store.load_capture(name)).hash == inputs[name]]
+    warnings = []
+    for what, value in capture.lens.items():
+        known = [pose.lens[what] for pose in poses if what in pose.lens]
+        reach = LENS_TOLERANCE * abs(value)
+        if known and not min(known) - reach <= value <= max(known) + reach:
+            low, high = f"{min(known):.6g}", f"{max(known):.6g}"
+            warnings.append(
+                f"{capture.name}: the camera's {what} is {value:.6g}, and was"
+                f" {low if low == high else f'{low} to {high}'} in the poses of the calibration,"
+                " which does not hold for another one: set it back, or calibrate as it is now"
+            )
+    return tuple(warnings)
 
 
 def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:

@@ -22,6 +22,7 @@ from slviewer.pipeline.models import (
     ModelName,
     check_accepted,
     frame_of,
+    lens_warnings,
     load_model,
     load_models,
     load_stereo,
@@ -33,7 +34,7 @@ from slviewer.pipeline.scale import describe_calibration, scale_cloud, scale_fac
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.pipeline.stored_records import is_up_to_date, load_record, numbered_names, placed_file
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
-from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.reconstruction.cloud import Cloud, Misfit, choose_pixels, keep_pixels
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud, triangulate_grid
 from slviewer.reconstruction.relative_phase import resolve_phase
 from slviewer.records.merge import Merge
@@ -219,6 +220,8 @@ def cloud_record(
         "sigma_calibration": cloud.sigma_calibration,
         "sigma_edges": cloud.sigma_edges,
     }
+    if cloud.misfit is not None:
+        arrays |= vars(cloud.misfit)
     known = {name: array for name, array in arrays.items() if array is not None}
     left = cloud.sigma_calibration
     record = Reconstruction(
@@ -230,6 +233,7 @@ def cloud_record(
         noise_mm=float(np.median(cloud.sigma_z[cloud.mask])),
         sigma_calibration_mm=None if left is None else float(np.median(left[cloud.mask])),
         raised=model.residuals_over_noise(cloud.axis) if isinstance(model, SplinedModel) else 1.0,
+        misfit_px=None if cloud.misfit is None else float(cloud.misfit.excess_px.max()),
         masked=masked_share(model, phase, region),
         frame=frame_of(store, cloud.model),
         **describe_calibration(store, cloud.model, [settings.capture]),
@@ -420,30 +424,26 @@ def capture_cloud(
 
     Raises InputError where capture and calibration do not belong together: by their sizes, or by
     how far the axes of the capture miss each other, which is a warning if ``accept_rejected``.
-    Where they miss each other by more than noise explains, the cloud's sigmas are raised by that
-    factor, with a warning.
+    Where they miss each other by more than noise explains, the cloud has that `Misfit`, with a
+    warning.
     """
     stereo = load_stereo(store)
     check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
     calibration = model if isinstance(model, SplinedModel) else stereo
     check = check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
-    for message in check.warnings:
+    for message in (*lens_warnings(store, capture), *check.warnings):
         warn(message)
     cloud = scale_cloud(
         reconstruct_cloud(model, phases, axis=axis, texture=texture),
         scale_factor(store, model.name),
     )
-    if check.excess_px is not None:  # by tiles of the image, in addition to the noise
-        noise_px, known = phases[cloud.axis].sigma_px, cloud.sigma_edges
-        excess = cv2.resize(check.excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
-        return replace(cloud, sigma_edges=error if known is None else np.hypot(known, error))
-    factor, sigma = np.float32(check.sigma_factor), cloud.sigma_calibration
-    return replace(
-        cloud,
-        sigma_z=cloud.sigma_z * factor,
-        sigma_calibration=None if sigma is None else sigma * factor,
-    )
+    if (misfit := check.misfit) is None:
+        return cloud
+    noise_px, known = phases[cloud.axis].sigma_px, cloud.sigma_edges
+    excess = cv2.resize(misfit.excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
+    edges = error if known is None else np.hypot(known, error)
+    return replace(cloud, sigma_edges=edges, misfit=misfit)
 
 
 def absolute_phases(
@@ -539,9 +539,12 @@ def scan_cloud(
     region = resolve_region(store, roi)
     meta = store.load_result(stored, only=())[0] if is_up_to_date(store, stored) else {}
     if meta and model in (None, "", meta["model"]):
-        names = {"points", "sigma_z", "texture", "sigma_calibration", "sigma_edges"}
-        arrays = store.load_result(stored, only=names & set(meta["arrays"]))[1]
-        cloud = Cloud(axis=meta["axis"], model=meta["model"], **arrays)
+        names = set(meta["arrays"]) - {"phase", "modulation"}
+        arrays = store.load_result(stored, only=names)[1]
+        for message in lens_warnings(store, store.load_capture(name)):
+            job.warn(message)
+        misfit = Misfit.pop_from(arrays)
+        cloud = Cloud(axis=meta["axis"], model=meta["model"], misfit=misfit, **arrays)
     else:
         fitted, accepts = load_model(store, model), accept_rejected
         *_, cloud = next(reconstruct_captures(job, fitted, [name], accept_rejected=accepts))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
@@ -21,6 +22,8 @@ from slviewer.geometry.rigid import Floats, Floats32
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.geometry.vectors import lengths
+from slviewer.reconstruction.cloud import Misfit
+from slviewer.reconstruction.rig_change import CHANGES, bound_change, change_rig
 
 SAMPLE = 20_000
 """Pixels compared; more do not change a median."""
@@ -127,15 +130,12 @@ class AxisAgreement:
 
 @dataclass(frozen=True)
 class CaptureCheck:
-    """Result of a check. ``sigma_factor``: by how much the predicted sigma is too small, 1 where it
-    is not. ``excess_px``: float32, `TILES`, the px of the projector by which the axes miss each
-    other in each tile of the image beyond what is predicted; None where they do so nowhere, or
-    everywhere alike."""
+    """Result of a check. ``misfit``: what the axes contradict beyond what is predicted; None where
+    they do so nowhere."""
 
-    sigma_factor: float = 1.0
     warnings: tuple[str, ...] = ()
     agreement: AxisAgreement | None = None
-    excess_px: Floats32 | None = None
+    misfit: Misfit | None = None
 
 
 def check_sizes(name: str, camera: Size, projector: Size | None, calibrated: StereoRig) -> None:
@@ -201,7 +201,7 @@ def check_phases(
                 f"{name}: {100 * (1 - share):.0f} % of the decoded pixels meet no point that the"
                 " calibrated projector could light: see that the calibration belongs to this rig"
             )
-        return CaptureCheck(1.0, (*warnings, *_depth_warning(name, depths, depth_range)))
+        return CaptureCheck((*warnings, *_depth_warning(name, depths, depth_range)))
     pixels, measured, sigma = _samples(phases)
     agreement = measure_axis_agreement(calibration, pixels, measured, sigma)
     if agreement is None:
@@ -211,16 +211,21 @@ def check_phases(
             f"{name}: {_describe_contradiction(agreement)}:"
             f" {_likely_reason(agreement, rig, pixels, measured)}"
         )
-    factor = agreement.ratio if agreement.ratio > RAISED_RATIO else 1.0
-    if factor > 1.0 and not agreement.is_refused:
-        warnings.append(
-            f"{name}: the x and y patterns disagree by {agreement.misfit_px:.2f} px with this"
-            f" calibration, and noise explains {agreement.predicted_px:.2f} px: the uncertainty of"
-            f" the points was raised by a factor of {factor:.1f}; the rig may have moved since it"
-            " was calibrated (run `slviewer check`), or the frames are disturbed"
-        )
-    excess = local_misfit(calibration, pixels, measured, sigma) if factor == 1.0 else None
-    if excess is not None:
+    excess, misfit = local_misfit(calibration, pixels, measured, sigma), None
+    if agreement.ratio > RAISED_RATIO:
+        everywhere = np.sqrt(agreement.misfit_px**2 - agreement.predicted_px**2)
+        excess = np.maximum(0.0 if excess is None else excess, np.full(TILES, everywhere, "f4"))
+        misfit = Misfit(excess, _bound_change(calibration, pixels, measured, sigma))
+        if not agreement.is_refused:
+            warnings.append(
+                f"{name}: the x and y patterns disagree by {agreement.misfit_px:.2f} px with this"
+                f" calibration, and noise explains {agreement.predicted_px:.2f} px: the uncertainty"
+                f" of the points was raised by a factor of {agreement.ratio:.1f}; focus, zoom or a"
+                " device may have moved since the calibration (run `slviewer check`), or the frames"
+                " are disturbed"
+            )
+    elif excess is not None:
+        misfit = Misfit(excess)
         warnings.append(
             f"{name}: in {100 * np.mean(excess > 0):.0f} % of the image the x and y patterns"
             f" disagree by up to {excess.max():.2f} px (elsewhere {agreement.misfit_px:.2f} px):"
@@ -228,12 +233,48 @@ def check_phases(
             " projector's light (a glossy table or wall, a shiny part, a deep corner), or for"
             " something that moved"
         )
-    return CaptureCheck(
-        factor,
-        (*warnings, *_depth_warning(name, agreement.depths_mm, depth_range)),
-        agreement,
-        excess,
-    )
+    warnings += _depth_warning(name, agreement.depths_mm, depth_range)
+    return CaptureCheck(tuple(warnings), agreement, misfit)
+
+
+def _bound_change(
+    calibration: Calibration, pixels: Floats, measured: Floats, sigma: Floats
+) -> Floats:
+    """Return what the misfit of the axes says of changes of the rig, as `bound_change`; arguments
+    as of `measure_axis_agreement`."""
+    rig = calibration.pinholes
+    known, distance, noise = _misfit(rig, *calibration.undistort_pairs(pixels, measured), sigma)
+    at = pixels[known], measured[known]
+    ends = [
+        [
+            epipolar_distance(
+                other, other.camera.undistort(at[0]), other.projector.undistort(at[1])
+            )[0]
+            for other in (change_rig(rig, unit), change_rig(rig, -unit))
+        ]
+        for unit in np.eye(CHANGES)
+    ]
+    values = np.stack([distance, noise, *((up - down) / 2 for up, down in ends)], axis=1)
+    values = np.column_stack([np.ones(len(values)), np.nan_to_num(values)])
+    sums = _sum_by_tile(rig, at[0], values)
+    count = sums[:, :1]
+    _, means, noises, effects = np.split(sums / count, [1, 2, 3], axis=1)
+    sigma_px = np.sqrt(noises / count + calibration.residual_px**2)
+    return bound_change(effects, means[:, 0], sigma_px[:, 0])
+
+
+def _tiles(rig: StereoRig, pixels: Floats) -> NDArray[np.intp]:
+    """Return the number of the tile that each pixel (n, 2) lies in."""
+    place = (pixels[:, ::-1] * TILES / rig.camera.size[::-1]).astype(int)
+    return np.ravel_multi_index(tuple(place.T), TILES)
+
+
+def _sum_by_tile(rig: StereoRig, pixels: Floats, values: Floats) -> np.ndarray:
+    """Return the sums (m, k) of ``values`` (n, k), the first of which are ones, over the tiles of
+    enough of the pixels (n, 2)."""
+    tile = _tiles(rig, pixels)
+    sums = np.stack([np.bincount(tile, column) for column in values.T], axis=1)
+    return sums[sums[:, 0] >= LEAST_IN_TILE]
 
 
 def local_misfit(
@@ -248,7 +289,7 @@ def local_misfit(
     """
     rig = calibration.pinholes
     known, distance, noise = _misfit(rig, *calibration.undistort_pairs(pixels, measured), sigma)
-    tile = (pixels[known, ::-1] * TILES / rig.camera.size[::-1]).astype(int) @ (TILES[1], 1)
+    tile = _tiles(rig, pixels[known])
     excess = np.zeros(TILES, np.float32)
     for number in np.unique(tile):
         is_inside = tile == number

@@ -7,12 +7,38 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.rigid import Mask
+from slviewer.geometry.rigid import Floats, Floats32, Mask
 
 Points = np.ndarray
 """Of an organised cloud (h, w, 3), or some of its points (n, 3), mm; or directions there."""
 Map = np.ndarray
 """(h, w): a value for each pixel of an organised cloud."""
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """What the axes of a capture contradict in its calibration: ``excess_px`` (rows, columns)
+    float32, the px of the projector by which they miss each other in each tile of the image beyond
+    what is predicted; ``change`` (8,) as `rig_change.bound_change` returns it, where they do so
+    everywhere, else None."""
+
+    excess_px: Floats32
+    change: Floats | None = None
+
+    @classmethod
+    def pop_from(cls, arrays: dict[str, np.ndarray]) -> "Misfit | None":
+        """Remove the fields from the stored arrays of a cloud; None where these hold none."""
+        change = arrays.pop("change", None)
+        return cls(arrays.pop("excess_px"), change) if "excess_px" in arrays else None
+
+    def text(self) -> str:
+        """Describe the misfit."""
+        share = 100 * np.mean(self.excess_px > 0)
+        where = "" if self.change is not None else f" in {share:.0f} % of the image"
+        return (
+            f"the x and y patterns disagree with the calibration{where}"
+            f" by up to {self.excess_px.max():.2f} px more than predicted: U was raised by that"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,10 +49,10 @@ class Cloud:
     that depth came from. ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm,
     predicted from the capture's noise. ``sigma_calibration``: (h, w) float32 mm of z too, what the
     calibration leaves uncertain, rigid motion apart: the same in every scan; None from a model that
-    does not know. ``sigma_edges``: (h, w) float32 mm, what the camera's blur at edges and light by
-    other paths add, systematic as well; None where nothing does. ``texture``: (h, w) grey or (h, w,
-    3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's range (10, 12, 14
-    or 16 bits, whichever holds its brightest pixel).
+    does not know. ``sigma_edges``: (h, w) float32 mm, what the camera's blur at edges and a
+    ``misfit`` of the axes add, systematic as well; None where nothing does. ``texture``: (h, w)
+    grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's
+    range (10, 12, 14 or 16 bits, whichever holds its brightest pixel).
     """
 
     points: Points
@@ -36,6 +62,7 @@ class Cloud:
     texture: np.ndarray | None = None
     sigma_calibration: Map | None = None
     sigma_edges: Map | None = None
+    misfit: Misfit | None = None
 
     def __post_init__(self) -> None:
         for name in ("points", "sigma_z", "sigma_calibration", "sigma_edges"):
@@ -87,14 +114,13 @@ class Cloud:
 
     def sigmas(self, chosen: Mask) -> dict[str, np.ndarray]:
         """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them:
-        ``sigma_noise``, and where the model knows it ``sigma_calibration`` and ``sigma``, all
-        together; mm of z."""
+        ``sigma_noise``, where the model knows it ``sigma_calibration``, and with that or a misfit
+        ``sigma``, all together; mm of z."""
         scalars = {"sigma_noise": self.sigma_z[chosen]}
         if self.sigma_calibration is not None:
-            scalars |= {
-                "sigma_calibration": self.sigma_calibration[chosen],
-                "sigma": self.sigma[chosen],
-            }
+            scalars["sigma_calibration"] = self.sigma_calibration[chosen]
+        if self.sigma_calibration is not None or self.misfit is not None:
+            scalars["sigma"] = self.sigma[chosen]
         return scalars
 
     @property

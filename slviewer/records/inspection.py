@@ -47,7 +47,8 @@ class Characteristic:
 
 class CharacteristicResult(msgspec.Struct, frozen=True):
     """A characteristic of one part: its ``value`` and ``U`` (k = 2), and the ``decision``; or the
-    ``reason`` why it could not be measured. ``whole``: whether U holds the calibration's part."""
+    ``reason`` why it could not be measured, or why it is doubtful. ``whole``: whether U holds the
+    calibration's part."""
 
     name: str
     value: float | None

@@ -1,7 +1,7 @@
 """What was measured on scans: points, distances, fitted shapes, their relations, deviations from
 nominal models; and a measured number with its unit and uncertainty."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -192,7 +192,7 @@ class NominalDeviation(msgspec.Struct, frozen=True):
             else [*listed, Quantity("within tolerance", verdict.within, "%")]
         )
 
-    def table(self, name: str, source: str) -> Table:
+    def table(self, name: str, source: str, warnings: Sequence[str] = ()) -> Table:
         """Return all figures, with the decision for each end of the range where there is a
         tolerance."""
         numbers, verdict, nominal = self.statistics_mm, self.verdict, self.nominal
@@ -238,6 +238,7 @@ class NominalDeviation(msgspec.Struct, frozen=True):
                 f" {self.reach_mm:.3g} mm from the nominal or face another way, and are excluded."
                 f" The best fit adds {self.alignment_mm:.4f} mm (1 sigma)."
             ),
+            *(f"{warning}." for warning in warnings),
             *([] if verdict is None else [f"{verdict.text()}, {RULE}."]),
         ]
         return Table.of(rows, f"Deviation from nominal: {name}", notes).without_empty()
@@ -364,7 +365,7 @@ class Measurement(Record, frozen=True, kw_only=True):
         measured = {name: each for name, each in found.items() if each.deviation is None}
         tables = [list_quantities(measured)] if measured else []
         return tables + [
-            each.deviation.table(name, each.source)
+            each.deviation.table(name, each.source, each.warnings)
             for name, each in found.items()
             if each.deviation is not None
         ]

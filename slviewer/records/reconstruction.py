@@ -16,12 +16,14 @@ class Reconstruction(Record, frozen=True, kw_only=True):
 
     Arrays, on the camera's grid: ``points`` (h, w, 3) float32 mm, ``sigma_z`` mm, ``phase`` rad,
     ``modulation`` (h, w) float32, NaN where invalid; ``texture`` (h, w) or (h, w, 3) uint8; of some
-    models ``sigma_calibration`` and ``sigma_edges`` (h, w) float32 mm. ``depth_mm``: 1st and 99th
+    models ``sigma_calibration`` and ``sigma_edges`` (h, w) float32 mm; of some captures the parts
+    ``excess_px`` and ``change`` of a `Misfit`. ``depth_mm``: 1st and 99th
     percentile; ``noise_mm`` and ``sigma_calibration_mm``: medians, of the depth's noise and of what
     the calibration leaves uncertain; ``raised``: the calibration's residuals over their predicted
-    noise, by which sigmas are raised; ``masked``: share of the pixels, 0 to 1, outside the
-    calibrated region, None for models that mask none; ``scale``: the correction of scale, in words;
-    ``frame``: the one that the points are in, in words.
+    noise, by which sigmas are raised; ``misfit_px``: by how much, at most, the axes of the capture
+    miss each other beyond what is predicted, None where they do not; ``masked``: share of the
+    pixels, 0 to 1, outside the calibrated region, None for models that mask none; ``scale``: the
+    correction of scale, in words; ``frame``: the one that the points are in, in words.
     """
 
     kind: ClassVar[str] = "clouds"
@@ -33,6 +35,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     noise_mm: float | None = None
     sigma_calibration_mm: float | None = None
     raised: float = 1.0
+    misfit_px: float | None = None
     masked: float | None = None
     scale: str = ""
     frame: str = ""
@@ -82,6 +85,12 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             " this capture's as well."
             for name, each in found.items()
             if each.raised > REPORTED_RAISE
+        ]
+        raised += [
+            f"{name}: sigma was raised: the x and y patterns disagree by up to"
+            f" {each.misfit_px:.2f} px more than predicted."
+            for name, each in found.items()
+            if each.misfit_px is not None
         ]
         frames = {each.frame: None for each in found.values() if each.frame}
         note = (

@@ -56,6 +56,7 @@ class Verification(Record, frozen=True, kw_only=True):
     incidence: dict[str, float] | None = None
     share: float | None = None
     region_px: tuple[int, int, int, int] | None = None
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -210,6 +211,7 @@ def _list_notes(found: Mapping[str, Verification]) -> list[str]:
             " illuminated."
         )
     for name, each in found.items():
+        notes += [f"{name}: {warning}" for warning in each.warnings]
         if each.region_px is not None:
             left, right, top, bottom = each.region_px
             share = (

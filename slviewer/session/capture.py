@@ -132,6 +132,11 @@ class Capture:
         return None if stored is None else from_plain(stored, TurnStep)
 
     @property
+    def lens(self) -> dict[str, float]:
+        """What the camera reported of its "focus", "zoom" and "aperture", in its own units."""
+        return from_plain(self.meta.get("settings", {}).get("lens", {}), dict[str, float])
+
+    @property
     def exposure_choice(self) -> np.ndarray | None:
         """(h, w) uint8: which of `exposures_ms` each pixel's frames are of; None for a single
         exposure."""
@@ -312,6 +317,7 @@ def _read_capture(folder: Path, identity: object) -> Capture:
     with decoding(folder / "capture.json"):
         described = from_plain(meta, _Description)
         sequence = PatternSequence.from_dict(described.sequence)
+        from_plain(described.settings.get("lens", {}), dict[str, float])
         if "turntable" in described.settings:
             from_plain(described.settings["turntable"], TurnStep)
     return Capture(

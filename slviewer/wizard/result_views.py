@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.pipeline.stored_records import is_up_to_date
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, Misfit
 from slviewer.report.maps import PixelCurve
 from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply
@@ -102,7 +103,8 @@ def whole_cloud(session: Session, name: str) -> ScanCloud:
     verified = f"verify/{name}"
     errors = session.load_result(verified)[1] if session.has_result(verified) else {}
     errors = {key.removeprefix("error_"): array for key, array in errors.items()}
-    return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)
+    known: dict[str, Any] = {"errors": errors, "misfit": Misfit.pop_from(arrays), **arrays}
+    return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], **known)
 
 
 def merged_cloud(session: Session, name: str) -> Ply:

@@ -105,6 +105,14 @@ def features(nodes: SimpleNamespace) -> Features:
     return Features(nodes, "the camera")
 
 
+def test_the_state_of_a_motorised_lens_is_read():
+    nodes = machine_vision_camera()
+    assert features(nodes).read_lens() == {}
+    nodes.FocusStepper, nodes.FocalLength = Number(1200), Number(25.1)
+    nodes.Iris = Number(4, access=NOT_NOW)
+    assert features(nodes).read_lens() == {"focus": 1200.0, "zoom": 25.1}
+
+
 def test_a_camera_is_made_comparable():
     nodes = machine_vision_camera()
     nodes.ExposureTime.access = BOTH

@@ -132,6 +132,7 @@ def test_a_webcam_is_set_and_read_back_and_its_automatics_are_switched_off(plugg
             cv2.CAP_PROP_FOCUS: 40.0,
             cv2.CAP_PROP_AUTO_WB: 0.0,
         }
+        assert camera.read_lens() == {"focus": 40.0}
         assert camera.apply(CameraSettings(12.5)) == CameraSettings(12.5) and camera.notes == ()
         assert camera.apply(CameraSettings(80.0)) == CameraSettings(50.0)
         (note,) = camera.notes

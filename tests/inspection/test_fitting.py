@@ -2,6 +2,7 @@
 holds another."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,15 @@ from facts import missing_facts, raises
 from shapes_of_points import MIDDLE, cylinder, plane, sphere, strewn
 
 from slviewer.errors import InputError
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import move_points
+from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature, least_squares
-from slviewer.inspection.uncertainty import scatter_covariance
+from slviewer.inspection.uncertainty import PointErrors, scatter_covariance
+from slviewer.reconstruction.cloud import Misfit
+from slviewer.reconstruction.rig_change import PointResponse, change_rig
 from slviewer.records.measurement import Quantity
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json
@@ -32,6 +39,78 @@ def test_a_sphere_with_strays_has_its_radius_within_its_uncertainty() -> None:
     )
     radius, diameter, *_ = found.quantities()
     assert diameter.value == 2 * radius.value and abs(diameter.U / sigma - 4) < 0.05
+
+
+NORMAL = Lens(np.array([[900.0, 0, 200], [0, 900, 150], [0, 0, 1]]), np.zeros(5), (400, 300))
+WIDE = Lens(np.array([[1400.0, 0, 456], [0, 2800, 570], [0, 0, 1]]), np.zeros(5), (912, 1140))
+ANGLE = 0.29
+R = np.array([[np.cos(ANGLE), 0, np.sin(ANGLE)], [0, 1, 0], [-np.sin(ANGLE), 0, np.cos(ANGLE)]])
+RIG = StereoRig(NORMAL, WIDE, R, np.array([-172.0, -4.0, 54.0]))
+BALL = np.array([0.0, 0.0, 700.0])
+
+
+def measured_ball(change: np.ndarray, form_mm: float = 0.0) -> np.ndarray:
+    """Points (n, 3) on a ball of 98 mm radius, by a rig that changed after its calibration."""
+    real = change_rig(RIG, change)
+    points = sphere(6000, 98.0, 0.9, 0.0) - MIDDLE
+    points *= 1 + form_mm / 98 * np.cos(6 * np.arctan2(points[:, 1], points[:, 0]))[:, None]
+    pixels, coordinate = real.camera.project(points + BALL), real.project(points + BALL)[:, 0]
+    coordinate = coordinate + 0.01 * np.random.default_rng(2).normal(size=len(points))
+    found = triangulate_pixels(RIG, pixels, coordinate, "x")
+    return found[np.isfinite(found).all(axis=1)]
+
+
+CHANGED = {
+    "camera's focus by 0.5 %": (0, 1.0, 1.66),
+    "camera's focus by -0.3 %": (0, -0.6, 0.95),
+    "projector's focus by 0.5 %": (1, 1.0, 0.46),
+    "turned by 1 mrad": (3, 1.0, 0.22),
+}
+
+
+@pytest.mark.parametrize("what", CHANGED)
+def test_a_rig_that_changed_is_a_finding_and_in_the_uncertainty(what: str) -> None:
+    which, size, off_mm = CHANGED[what]
+    points = measured_ball(size * np.eye(8)[which])
+    response = PointResponse(RIG, "x", points[::50], residual_px=1e-4)
+    found = fit_feature("sphere", points, PointErrors(response=response))
+    assert abs(2 * found.feature.radius - 196) == pytest.approx(off_mm, abs=0.03)
+    assert off_mm < 4 * found.spread.sigmas[3] < 4.0
+    assert not missing_facts(found.warnings[0], "times worse", "mm", "Focus", "form", "check")
+
+
+def test_a_rig_that_did_not_change_is_no_finding_and_leaves_the_uncertainty() -> None:
+    points = measured_ball(np.zeros(8))
+    response = PointResponse(RIG, "x", points[::50], residual_px=1e-4)
+    plain = fit_feature("sphere", points)
+    found = fit_feature("sphere", points, PointErrors(response=response))
+    assert found.warnings == () and np.array_equal(found.spread.sigmas, plain.spread.sigmas)
+    points = measured_ball(np.eye(8)[0])  # by a calibration of unknown errors
+    unknown = PointErrors(response=PointResponse(RIG, "x", points[::50]))
+    assert fit_feature("sphere", points, unknown).warnings == ()
+
+
+def test_a_misfit_of_the_axes_is_in_the_uncertainty_wherever_the_part_lies() -> None:
+    points = measured_ball(np.zeros(8))
+    excess = np.zeros((12, 16), np.float32)
+    excess[4:9, 5:11] = 0.5
+    known = PointErrors(response=PointResponse(RIG, "x", points[::50], residual_px=1e-4))
+    local = PointErrors(response=replace(known.response, misfit=Misfit(excess)))
+    T = np.array([[0.0, -1, 0, 30], [1, 0, 0, -20], [0, 0, 1, 5], [0, 0, 0, 1]])
+    sigmas = [
+        fit_feature("sphere", move_points(M, points), errors.moved(M)).spread.sigmas[3]
+        for errors, M in ((known, np.eye(4)), (local, np.eye(4)), (local, T))
+    ]
+    assert 3 * sigmas[0] < sigmas[1] < 1.0 and sigmas[2] == pytest.approx(sigmas[1], rel=1e-3)
+    assert known.warnings == () and not missing_facts(local.warnings[0], "16 %", "0.50 px", "U")
+
+
+def test_a_part_with_form_errors_is_found_to_have_them_or_a_changed_rig() -> None:
+    points = measured_ball(np.zeros(8), form_mm=0.1)
+    response = PointResponse(RIG, "x", points[::50], residual_px=1e-4)
+    found = fit_feature("sphere", points, PointErrors(response=response))
+    assert not missing_facts(found.warnings[0], "the part has this form", "U allows for both")
+    assert abs(2 * found.feature.radius - 196) < 4 * found.spread.sigmas[3] < 1.0
 
 
 @pytest.mark.slow

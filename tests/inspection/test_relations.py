@@ -75,6 +75,8 @@ def test_what_one_calibration_leaves_uncertain_of_both_cancels() -> None:
     assert distance(A, B, a, b).sigma == pytest.approx(np.sqrt(2) * 1e-3, rel=1e-3)
     stranger = Spread(1e-6 * np.eye(3), shift, "another")
     assert distance(A, B, a, stranger).sigma == pytest.approx(0.2 * np.sqrt(2), rel=1e-2)
+    raised = Spread(1e-6 * np.eye(3), np.vstack([shift, 0.3 * np.eye(3)]), "one")
+    assert distance(A, B, a, raised).sigma == pytest.approx(0.3, rel=1e-2)  # what one scan adds
 
 
 def test_an_angle_of_zero_has_an_uncertainty() -> None:

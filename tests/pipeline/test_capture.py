@@ -45,7 +45,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_the_file_and_the_command_say_is_what_is_kept(folder: Path):
     with Session.open(folder / "session") as store:
         one, three = store.captures("calibration")
-    assert one.meta["settings"] == {"purpose": "pose", "exposure_ms": 0.9, "gain": 1.0}
+    assert one.lens == three.lens and one.lens["focus"] == pytest.approx(3565, abs=1)
+    known = {"purpose": "pose", "exposure_ms": 0.9, "gain": 1.0, "lens": one.lens}
+    assert one.meta["settings"] == known
     assert one.meta["board"] == three.meta["board"] == BOARD
     assert one.exposures_ms == () and three.exposures_ms == (0.5, 2.0, 8.0)
     assert one.size == three.size == (400, 300) and one.meta["source"] == "simulated"

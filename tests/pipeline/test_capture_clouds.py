@@ -13,6 +13,8 @@ from sound_checks import save_sound_checks
 
 from slviewer.fringe.presets import multifrequency
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.measure import measure
+from slviewer.pipeline.models import lens_warnings
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
@@ -96,6 +98,48 @@ def test_an_inverted_calibration_is_refused_and_may_be_insisted_on(session: Path
     assert not missing_facts(error, "R", "T", "inverted")
 
 
+def test_a_lens_that_was_set_otherwise_since_the_calibration_is_named(session: Path) -> None:
+    with Session.open(session, write=True) as store:
+        sound = store.load_capture("sound")
+        for name, role, focus in (
+            ("pose_01", "calibration", 40.0),
+            ("pose_02", "calibration", 41.0),
+            ("same", "scan", 41.0),
+            ("moved", "scan", 46.0),
+        ):
+            lens = {"lens": {"focus": focus}}
+            store.save_capture(name, role, sound.sequence, sound.frames, settings=lens)
+        meta = store.load_result("calibration/stereo", only=())[0]
+        inputs = store.input_hashes("pose_01", "pose_02")
+        own = {key: meta[key] for key in ("imported", "source", "camera", "projector")}
+        store.save_result("calibration/stereo", own | {"inputs": inputs}, {})
+        for name in ("sound", "same"):
+            assert lens_warnings(store, store.load_capture(name)) == ()
+        (warning,) = lens_warnings(store, store.load_capture("moved"))
+    assert not missing_facts(warning, "moved", "focus", "46", "40 to 41")
+
+
+def test_a_misfit_of_the_axes_reaches_every_uncertainty(session: Path) -> None:
+    """Of a projector that nodded by 0.2 mrad since it was calibrated, seen by both axes."""
+    settings = {"scan": "sound", "model": "stereo"}
+    distance = {**settings, "what": "distance", "at": (60, 60, 100, 60)}
+    plane = {**settings, "what": "plane", "ball": (0.0, 0.0, 600.0, 45.0)}
+    sound = [measure(session, **each).only for each in (distance, plane)]
+    nod = np.linalg.svd(np.array([[1, 0, 0], [0, 1, -2e-4], [0, 2e-4, 1]]))
+    with Session.open(session, write=True) as store:
+        R = nod.U @ nod.Vh
+        save_true_stereo(store, RIG, R=R @ RIG.R, T=R @ RIG.t)
+    bumped = [measure(session, **each).only for each in (distance, plane)]
+    assert all(each.warnings == () for each in sound)
+    for each in bumped:
+        assert not missing_facts(each.warnings[0], "x and y", "px", "U was raised")
+    before, after = (each[0]["distance"].U for each in (sound, bumped))
+    assert 1.5 * before < after < 20 * before
+    assert not bumped[0]["distance"].whole
+    before, after = (np.trace(np.array(each[1].feature.scatter)) for each in (sound, bumped))
+    assert after == pytest.approx(before, rel=0.2)  # the raise is in the part that fits share
+
+
 def test_sigma_is_raised_where_the_axes_miss_each_other(
     session: Path, run: Run, tmp_path: Path
 ) -> None:
@@ -107,6 +151,7 @@ def test_sigma_is_raised_where_the_axes_miss_each_other(
     status, _, error = run("reconstruct", session, "sound", "--out", tmp_path / "bumped.ply")
     assert status == 0 and "factor" in error
     sound, bumped = (
-        read_ply(tmp_path / f"{name}.ply").scalars["sigma_noise"] for name in ("sound", "bumped")
+        read_ply(tmp_path / f"{name}.ply").scalars[kind]
+        for name, kind in (("sound", "sigma_noise"), ("bumped", "sigma"))
     )
     assert np.median(bumped) > 5 * np.median(sound)

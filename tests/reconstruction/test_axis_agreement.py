@@ -88,7 +88,7 @@ def test_the_misfit_of_a_sound_capture_is_its_noise() -> None:
         600, abs=15
     )
     check = check_phases("scan", phases(found), by(true), CALIBRATED)
-    assert (check.sigma_factor, check.warnings) == (1.0, ())
+    assert (check.misfit, check.warnings) == (None, ())
 
 
 def flipped(found: np.ndarray, x: bool, y: bool) -> np.ndarray:
@@ -134,16 +134,20 @@ def test_a_rig_that_was_moved_is_refused_or_raises_sigma() -> None:
     with raises(InputError, "rig"):
         check_phases("scan", found, by(turned(true, (3.0, 0, 0))))
     accepted = check_phases("scan", found, by(turned(true, (3.0, 0, 0))), accept=True)
-    assert accepted.warnings and accepted.sigma_factor > 100
+    assert accepted.warnings and accepted.agreement and accepted.agreement.ratio > 100
     little = check_phases("scan", found, by(turned(true, (0.1, 0, 0))))  # 0.28 px in the rows
-    assert 6 < little.sigma_factor < 15 and not missing_facts(little.warnings[0], "uncertainty")
+    assert little.agreement and 6 < little.agreement.ratio < 15
+    assert little.misfit is not None and little.misfit.change is not None
+    nod_mrad = np.linalg.norm(little.misfit.change[2])  # in units of 1 mrad
+    assert 0.09 < nod_mrad < 0.2
+    assert not missing_facts(little.warnings[0], "uncertainty")
 
 
 def test_residuals_of_the_calibration_are_no_contradiction() -> None:
     true, found = rig(), phases(coordinates(rig()))
     rms = {"camera": 0.05, "projector": 0.3, "stereo": 0.22}
     model = replace(by(turned(true, (0.1, 0, 0))), reprojection_rms_px=rms)
-    assert check_phases("scan", found, model).sigma_factor == 1.0
+    assert check_phases("scan", found, model).misfit is None
 
 
 def test_one_axis_is_judged_by_what_the_projector_could_light_and_by_depth() -> None:
@@ -174,8 +178,8 @@ def test_light_by_another_path_raises_sigma_where_it_falls() -> None:
     wave = 0.3 * np.dstack([np.sin(u / 1.7 + v), np.sin(u / 2.3 - v)])
     bent = found + np.where((v > 90)[..., None], wave, 0)
     check = check_phases("scan", phases(bent), by(true), CALIBRATED)
-    assert check.sigma_factor == 1.0 and check.excess_px is not None
-    excess = check.excess_px
+    assert check.misfit is not None and check.misfit.change is None
+    excess = check.misfit.excess_px
     illuminated = np.isfinite(found[..., 0]).reshape(12, 10, 16, 10).mean((1, 3)) > 0.5
     assert (excess[:9] == 0).all() and (excess[9:][illuminated[9:]] > 0).mean() > 0.9
     assert 0.1 < np.median(excess[excess > 0]) < 0.4
