@@ -29,6 +29,8 @@ MAX_RMS_RATIO = 1.5
 """Residuals in a fixed camera over those in a free one, from which on its lens is another."""
 MAX_FOCAL_UNCERTAINTY = 0.02
 """Relative standard deviation from which on the poses do not determine a focal length well."""
+SERIOUS_CHANGE = 0.0025
+"""Of a focal length, from which on a fixed one is doubtful, whatever its file states."""
 CHANGE_SIGMAS = 4.0
 """Least significant difference of a fixed focal length from what the poses give."""
 
@@ -74,9 +76,11 @@ class CameraCheck:
         return max(self.stated, abs(self.change) * self.is_significant)
 
 
-def judge_camera(check: CameraCheck) -> Iterator[Finding]:
-    """Yield a finding where a fixed camera is not that of the poses; a note within the uncertainty
-    that its file states."""
+def judge_camera(check: CameraCheck | None) -> Iterator[Finding]:
+    """Yield a finding where a fixed camera is not that of the poses; a note where the difference is
+    small, and within the uncertainty of its file."""
+    if check is None:
+        return
     fixed, free = check.rms_px or (0.0, 0.0)
     is_misfit = fixed > MAX_RMS_RATIO * max(free, 0.02)
     if not (is_misfit or check.is_significant):
@@ -84,12 +88,14 @@ def judge_camera(check: CameraCheck) -> Iterator[Finding]:
     sentence = (
         f"the poses give the camera a focal length {100 * abs(check.change):.2f} +-"
         f" {100 * check.sigma:.2f} % {'longer' if check.change > 0 else 'shorter'} than"
-        f" {check.name}, which states it to {100 * check.stated:.2f} %"
+        f" {check.name}, which is uncertain by {100 * check.stated:.2f} %"
     )
     if check.rms_px:
-        sentence += f"; residuals are {fixed:.3f} px with that camera and {free:.3f} px with any"
+        sentence += (
+            f"; residuals are {fixed:.3f} px with that lens and {free:.3f} px with a free one"
+        )
     severity: Severity = "rejected" if is_misfit else "doubtful"
-    if not is_misfit and abs(check.change) < 2 * check.stated:
+    if not is_misfit and abs(check.change) < min(2 * check.stated, SERIOUS_CHANGE):
         severity = "note"
     again = (
         "calibrate the camera alone again (--camera-only), with the focus, zoom and image size that"

@@ -196,8 +196,7 @@ def calibrate_stereo(
     check_pose_count(len(used), excluded)
     if strict:
         check_handedness(used)
-        if not (camera and camera.is_fixed):
-            check_tilts(used)
+        check_tilts(used, camera)
 
     for remaining in range(4, -1, -1):
         model = _solve(used, inliers, projector_size, strict, camera)
@@ -382,11 +381,13 @@ def check_pose_count(count: int, excluded: Mapping[str, str]) -> None:
         )
 
 
-def check_tilts(used: Sequence[Observation]) -> None:
-    """Raise CalibrationRejected where all boards are nearly parallel.
+def check_tilts(used: Sequence[Observation], camera: KnownCamera | None = None) -> None:
+    """Raise CalibrationRejected where all boards are nearly parallel, unless the camera is fixed.
 
     Parallel boards share their vanishing line and do not determine the focal length.
     """
+    if camera is not None and camera.is_fixed:
+        return
     spread = nominal_tilt_spread_deg(used)
     if spread < MIN_TILT_SPREAD_DEG:
         raise CalibrationRejected(

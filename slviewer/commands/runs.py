@@ -177,7 +177,8 @@ class CalibrateOptions:
             validate` does.
         camera_only: Calibrate the camera's lens alone, from pictures of the board in the session,
             or in a folder in its place; the session stays as it is.
-        out: With --camera-only: write the lens to this .yml, .xml or .json, for --camera and OpenCV.
+        out: With --camera-only: write the lens to this .yml, .xml or .json, for --camera and for
+            OpenCV.
     """
 
     validate: bool = False

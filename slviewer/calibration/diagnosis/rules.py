@@ -14,11 +14,7 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic
-from slviewer.calibration.known_camera import (
-    MAX_FOCAL_UNCERTAINTY,
-    CameraCheck,
-    judge_camera,
-)
+from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY, CameraCheck, judge_camera
 from slviewer.calibration.observe import AXES
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, MIN_TILT_SPREAD_DEG
@@ -503,12 +499,6 @@ def diagnose_parallel_poses(e: Evidence) -> Iterator[Finding]:
     )
 
 
-def diagnose_camera(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where the poses contradict a fixed camera."""
-    if e.camera is not None:
-        yield from judge_camera(e.camera)
-
-
 def diagnose_solution(e: Evidence) -> Iterator[Finding]:
     """Yield findings on corners of the image that no pose covers, on a large reprojection error,
     and on focal lengths that the poses leave uncertain.
@@ -550,7 +540,7 @@ STAGES: tuple[tuple[Callable[[Evidence], Iterator[Finding]], ...], ...] = (
     (diagnose_frame_order, diagnose_saturation),
     (diagnose_mirroring, diagnose_period, diagnose_description, diagnose_board_size),
     (
-        diagnose_camera,
+        lambda e: judge_camera(e.camera),
         diagnose_single_poses,
         diagnose_gamma,
         diagnose_ripple,

@@ -14,7 +14,7 @@ from slviewer.calibration.splined.half_turns import (
     is_numbering_ambiguous,
     renumber_poses,
 )
-from slviewer.calibration.splined.held_camera import hold_lens, lens_like_fields, release_lens
+from slviewer.calibration.splined.held_camera import HeldLens
 from slviewer.calibration.splined.normal import (
     BlockFactor,
     ObservedValues,
@@ -109,11 +109,9 @@ def adjust_bundle(
     names, data, sample_sigma = gather_data(observations, stereo)
     T = np.array([stereo.poses[name] for name in names])
     state = State.from_rig(stereo.rig, T, len(data.points), cells_across)
-    known = stereo.known_camera
-    gauge = None
-    if known is not None:
-        gauge = lens_like_fields(state.rig.camera, known.lens, data.sample_px)
-    layout, prior = state.layout, Prior.build(state, data.points, gauge)
+    layout = state.layout
+    held = HeldLens(stereo.known_camera, state.rig.camera, data.sample_px, layout.rig)
+    prior = Prior.build(state, data.points, held.gauge)
     is_excluded = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
     certain = np.array(
@@ -138,7 +136,7 @@ def adjust_bundle(
                 w[is_excluded[pose]] = 0.0
             A, b = normal_equations(state, data, residuals, weights)
             prior.add(A, b, state)
-            held = hold_lens(A, b, layout.rig) if known else None
+            held.take(A, b)
             factor = BlockFactor(A, layout)
             count = int(sum(np.count_nonzero(w) for w in weights))
             system = A, b, factor.solve(b)
@@ -179,7 +177,7 @@ def adjust_bundle(
         z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
         z = (z + state.t_board[pose, 2])[~is_excluded[pose]]
         camera_poses, projector_poses = _count_poses(state, weights[1], data)
-        check = release_lens(A, b, held, factor, known, layout.rig) if known and held else None
+        check = held.release(A, b, factor)
         rig_factor = factorize(A)[layout.rig :, layout.rig :]
         return Bundle(
             state=state,

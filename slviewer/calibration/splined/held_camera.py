@@ -13,12 +13,63 @@ from slviewer.geometry.splines import basis_matrix
 from slviewer.geometry.vectors import finite_rows
 
 MOST_PIXELS = 4000
-EXACT_PX = 1e-3
-EXACT_DISTORTION = 1e-6
-"""Standard deviations of what files state without one: principal point, and distortion."""
+EXACT = np.array([1e-3] * 4 + [1e-6] * 5)
+"""(9,): standard deviations of the lens's parameters, which files do not state, beside that of the
+focal length."""
 
-Held = tuple[Floats, Floats, Floats]
-"""What `hold_lens` took out of the normal equations."""
+
+class HeldLens:
+    """A known lens in the normal equations, whose unknowns from ``first`` on it holds where it is
+    fixed; nothing where ``known`` is None.
+
+    ``gauge``: what the camera's field must lack then (see `lens_like_fields`).
+    """
+
+    def __init__(
+        self, known: KnownCamera | None, device: Device, pixels: Floats, first: int
+    ) -> None:
+        self.known, self.lens = known, slice(first, first + LENS)
+        self.gauge = None if known is None else lens_like_fields(device, known.lens, pixels)
+
+    def take(self, A: Floats, b: Floats) -> None:
+        """Take the lens out of the equations, of which A has the upper triangle."""
+        if self.known is None:
+            return
+        lens, first = self.lens, self.lens.start
+        self.taken = A[:first, lens].copy(), A[lens, first:].copy(), b[lens].copy()
+        A[:first, lens] = A[lens, first:] = b[lens] = 0.0
+        A[lens, lens] = np.eye(LENS)
+
+    def release(self, A: Floats, b: Floats, factor: BlockFactor) -> CameraCheck | None:
+        """Put the lens back into the equations of the solution, with the uncertainty that it has;
+        return how the poses agree with it.
+
+        ``factor``: of the equations without it. One step with a free lens is what the poses give.
+        """
+        if self.known is None:
+            return None
+        known, lens, first = self.known, self.lens, self.lens.start
+        above, beside, gradient = self.taken
+        coupling = np.zeros((len(b), LENS))
+        coupling[:first], coupling[lens.stop :] = above, beside[:, LENS:].T
+        shared = coupling.T @ factor.solve(coupling)
+        own = np.triu(beside[:, :LENS])
+        information = own + np.triu(own, 1).T - shared
+        focal = np.diag(known.lens.K)[:2]
+        relative = np.append(0.5 / focal, np.zeros(LENS - 2))
+        step = np.linalg.solve(information, gradient - coupling.T @ factor.solve(b))
+        check = CameraCheck(
+            known.name,
+            float(relative @ step),
+            float(np.sqrt(relative @ np.linalg.solve(information, relative))),
+            known.focal_sigma_px / float(focal[0]),
+        )
+        scale = np.append(focal * check.uncertainty, np.zeros(LENS - 2))
+        stated = np.linalg.inv(np.diag(EXACT**2) + np.outer(scale, scale))
+        # what the others know of the lens counts, and of its own information the file's alone
+        A[:first, lens], A[lens, first:] = above, beside
+        A[lens, lens] = shared + stated
+        return check
 
 
 def lens_like_fields(device: Device, lens: Lens, pixels: Floats) -> Floats:
@@ -40,47 +91,3 @@ def lens_like_fields(device: Device, lens: Lens, pixels: Floats) -> Floats:
     products = (down[:, :, None] * across[:, None, :]).reshape(len(pixels), -1)
     alike = np.hstack([by_lens[k::2].T @ products for k in range(2)])
     return np.linalg.qr(alike.T)[0].T
-
-
-def hold_lens(A: Floats, b: Floats, first: int) -> Held:
-    """Take the camera's lens, from unknown ``first`` on, out of the normal equations, of which A
-    has the upper triangle; `release_lens` puts it back."""
-    lens = slice(first, first + LENS)
-    held = A[:first, lens].copy(), A[lens, first:].copy(), b[lens].copy()
-    A[:first, lens] = A[lens, first:] = b[lens] = 0.0
-    A[lens, lens] = np.eye(LENS)
-    return held
-
-
-def release_lens(
-    A: Floats, b: Floats, held: Held, factor: BlockFactor, known: KnownCamera, first: int
-) -> CameraCheck:
-    """Put the lens back into the normal equations of the solution, with the uncertainty that it
-    has; return how the poses agree with it.
-
-    ``factor``: of the equations without it; ``first``: its first unknown. One step with a free lens
-    is what the poses give.
-    """
-    last = first + LENS
-    above, beside, own_gradient = held
-    coupling = np.zeros((len(b), LENS))
-    coupling[:first], coupling[last:] = above, beside[:, LENS:].T
-    shared = coupling.T @ factor.solve(coupling)
-    gradient = own_gradient - coupling.T @ factor.solve(b)
-    own = np.triu(beside[:, :LENS])
-    information = own + np.triu(own, 1).T - shared
-    focal = np.diag(known.lens.K)[:2]
-    relative = np.append(0.5 / focal, np.zeros(LENS - 2))
-    check = CameraCheck(
-        known.name,
-        float(relative @ np.linalg.solve(information, gradient)),
-        float(np.sqrt(relative @ np.linalg.solve(information, relative))),
-        known.focal_sigma_px / float(focal[0]),
-    )
-    exact = np.array([EXACT_PX] * 4 + [EXACT_DISTORTION] * 5)
-    scale = np.append(focal * check.uncertainty, np.zeros(LENS - 2))
-    # what the others know of the lens counts, and of its own information the file's alone
-    A[:first, first:last], A[first:last, first:] = above, beside
-    stated = np.linalg.inv(np.diag(exact**2) + np.outer(scale, scale))
-    A[first:last, first:last] = shared + stated
-    return check

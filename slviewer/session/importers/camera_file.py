@@ -23,8 +23,9 @@ MATRICES = (
     "kc", "camint", "mtx", "m1", "k1", "k",
 )  # fmt: skip
 DISTORTIONS = (
-    "dcamera", "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeffs1", "camkc",
-    "dcam", "camdist", "cameradistortion", "distortion", "dist", "dist1", "kc", "d1", "d",
+    "dcamera", "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff",
+    "distcoeffs1", "camkc", "dcam", "camdist", "cameradistortion", "distortion", "dist", "dist1",
+    "kc", "d1", "d",
 )  # fmt: skip
 SIZES = ("camerasize", "camsize", "imagesize", "resolution")
 PAIRS = (("imagewidth", "imageheight"), ("framewidth", "frameheight"), ("width", "height"))
@@ -81,7 +82,11 @@ def read_camera_file(path: Path | str, size: tuple[int, int]) -> CameraFile:
                 f" the middle of an image of {size[0]}x{size[1]} px, and it states no image size:"
                 " add image_width and image_height of the images that it was made from"
             )
-    lens = _adapt(Lens(K, D, stated or size), size, path.name, notes)
+    try:
+        lens = Lens(K, D, stated or size)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from error
+    lens = _adapt(lens, size, path.name, notes)
     sigma = found.numbers.get("focalsigmapx")
     return CameraFile(
         lens,

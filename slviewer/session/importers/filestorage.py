@@ -69,7 +69,7 @@ def _parse(path: str) -> tuple[dict[str, Any], dict[str, str]]:
     try:
         storage = cv2.FileStorage(path, cv2.FILE_STORAGE_READ)
         is_storage = storage.isOpened()
-    except cv2.error:
+    except (cv2.error, SystemError):
         is_storage = False
     if is_storage:
         tree = _plain(storage.root())
