@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import CalibrationRejected
+from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats, transform_from_rvec
 
 ITERATIONS = 200
@@ -44,18 +45,28 @@ def intersect_board(T: Floats, rays: Floats) -> Floats:
 
 
 def solve_device(
-    device: str, points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
+    device: str,
+    points: Sequence[np.ndarray],
+    pixels: Sequence[np.ndarray],
+    size: tuple[int, int],
+    start: Lens | None = None,
 ) -> tuple[np.ndarray, np.ndarray, list[Floats], tuple[float, float]]:
     """Solve a pinhole and Brown lens from points (n, 3) mm and pixels (n, 2) of each pose.
 
     Returns K (3, 3), D (5,), T_device_board (4, 4) mm of each pose, and the standard deviations of
     fx and fy in px. ``device``: for the message of CalibrationRejected, which is raised where
-    OpenCV finds no solution.
+    OpenCV finds no solution; ``start``: initial lens, by default OpenCV's estimate.
     """
     objects, images = ([each.astype(np.float32) for each in arrays] for arrays in (points, pixels))
     try:
         _, K, D, rvecs, tvecs, deviations, _, _ = cv2.calibrateCameraExtended(
-            objects, images, size, np.zeros((3, 3)), np.zeros(5), criteria=CRITERIA
+            objects,
+            images,
+            size,
+            np.zeros((3, 3)) if start is None else start.K.copy(),
+            np.zeros(5) if start is None else start.D.copy(),
+            flags=0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS,
+            criteria=CRITERIA,
         )
     except cv2.error as error:
         raise CalibrationRejected(

@@ -11,10 +11,10 @@ from slviewer.calibration.centres import centroid_shifts
 from slviewer.calibration.diagnosis.rules import (
     FEW_POSES,
     HIGH_REPROJECTION_PX,
-    MAX_FOCAL_UNCERTAINTY,
     MIN_TILT_DEG,
 )
-from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, check_pose_count
+from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY
+from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, check_pose_count
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats, largest_angle_deg, move_points
 from slviewer.geometry.vectors import rms_length
@@ -26,13 +26,18 @@ MAX_ERROR_RATIO = 3.0
 """Times the usual reprojection error, from which a picture is named: it was blurred, or its board
 bent or moved."""
 
+GROUPS = 10
+"""Largest number of calibrations without some of the pictures, whose spread is the uncertainty of
+all."""
+
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
     """A calibrated camera, its reprojection errors, and a verdict on it.
 
     ``rms_px``: reprojection error of all pictures together, ``picture_rms_px`` of each one (RMS
-    length of the residuals). ``focal_sigma_px``: standard deviations of fx and fy. ``excluded``:
+    length of the residuals). ``focal_sigma_px``: standard deviations of fx and fy, by the residuals
+    or by leaving pictures out, whichever is larger. ``excluded``:
     pictures not used, with the reason.
     """
 
@@ -101,6 +106,9 @@ def calibrate_camera(
             for centroids, T, X in zip(pixels, poses, points, strict=True)
         ]
         lens, poses, sigma = _solve_camera(points, pixels, size)
+    focal = np.diag(lens.K)[:2]
+    spread = _focal_spread(points, pixels, lens)
+    sigma = float(max(sigma[0], spread * focal[0])), float(max(sigma[1], spread * focal[1]))
     residuals = [
         lens.project(move_points(T, X)) - measured
         for X, T, measured in zip(points, poses, pixels, strict=True)
@@ -129,6 +137,26 @@ def _solve_camera(
     """
     K, D, poses, sigma = solve_device("camera", points, pixels, size)
     return Lens(K, D, size), poses, sigma
+
+
+def _focal_spread(points: list[Floats], pixels: list[Floats], lens: Lens) -> float:
+    """Return the relative standard deviation of the focal length by calibrations without some
+    pictures each (jackknife); 0 where too few would remain.
+
+    What Brown's polynomial lacks makes residuals depend on each other: their number understates
+    the uncertainty.
+    """
+    count = len(points)
+    groups = min(count, GROUPS)
+    if count - -(-count // groups) < MIN_POSES:
+        return 0.0
+    focal = []
+    for k in range(groups):
+        kept = [i for i in range(count) if i % groups != k]
+        fewer, seen = ([each[i] for i in kept] for each in (points, pixels))
+        K, _, _, _ = solve_device("camera", fewer, seen, lens.size, lens)
+        focal.append(float(np.mean(np.diag(K)[:2] / np.diag(lens.K)[:2])))
+    return float(np.sqrt(groups - 1) * np.std(focal))
 
 
 def _judge_camera(solved: CameraCalibration, poses: list[Floats]) -> Iterator[Finding]:

@@ -7,9 +7,11 @@ are accurate enough, as their error changes the correction by 1 % only.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.known_camera import KnownCamera
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
@@ -27,6 +29,7 @@ def calibrate_centres(
     excluded: Mapping[str, str] | None = None,
     *,
     strict: bool = True,
+    camera: KnownCamera | None = None,
 ) -> tuple[StereoModel, list[Observation]]:
     """Run ``calibrate_stereo`` on the circles' centroids, correct these to centres, and run it
     again.
@@ -34,12 +37,13 @@ def calibrate_centres(
     Parameters and errors are those of ``calibrate_stereo``. Returns the model and the corrected
     observations of the poses that it used.
     """
-    stereo = calibrate_stereo(observations, projector_size, board, excluded, strict=strict)
+    how: dict[str, Any] = {"strict": strict, "camera": camera}
+    stereo = calibrate_stereo(observations, projector_size, board, excluded, **how)
     used = [o for o in observations if o.name in stereo.poses]
     corrected = move_to_centres(used, stereo)
     if all(new is old for new, old in zip(corrected, used, strict=True)):
         return stereo, used
-    stereo = calibrate_stereo(corrected, projector_size, board, stereo.excluded, strict=strict)
+    stereo = calibrate_stereo(corrected, projector_size, board, stereo.excluded, **how)
     return stereo, [o for o in corrected if o.name in stereo.poses]
 
 

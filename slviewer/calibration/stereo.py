@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.board_pose import CRITERIA, solve_device
+from slviewer.calibration.known_camera import KnownCamera, Views, solve_beside
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.calibration.observe import Observation
 from slviewer.errors import CalibrationRejected
@@ -53,7 +54,8 @@ class StereoModel:
     standard deviation of the focal length by device, or the difference of the fits with and without
     the other device where that is larger. ``features_excluded``: number of outliers
     among the features. ``residuals_px`` (n, 4): camera and projector residuals of each pose's
-    features, NaN where excluded or not measured.
+    features, NaN where excluded or not measured. ``fixed_camera``: the file whose lens the camera
+    kept, or "".
     """
 
     rig: StereoRig
@@ -67,8 +69,16 @@ class StereoModel:
     focal_sigma_px: Mapping[str, float]
     features_excluded: int = 0
     residuals_px: Mapping[str, Floats] = field(default_factory=dict, repr=False)
+    fixed_camera: str = ""
 
     name = "stereo"
+
+    @property
+    def known_camera(self) -> KnownCamera | None:
+        """The camera that was fixed; None where it was calibrated with the projector."""
+        if not self.fixed_camera:
+            return None
+        return KnownCamera(self.rig.camera, self.fixed_camera, True, self.focal_sigma_px["camera"])
 
     @property
     def baseline_mm(self) -> float:
@@ -153,16 +163,18 @@ def calibrate_stereo(
     excluded: Mapping[str, str] | None = None,
     *,
     strict: bool = True,
+    camera: KnownCamera | None = None,
 ) -> StereoModel:
     """Calibrate camera and projector, pinhole and Brown (k1 k2 p1 p2 k3) each, and their relative
     pose (step 1).
 
     ``board``: its notation, stored with the model. ``excluded``: poses that were excluded before,
-    with the reason. Features beyond 6 robust sigma are excluded, and so is a pose most of whose
-    features are. Raises CalibrationRejected where the poses cannot determine the devices: too few,
-    all parallel, or features that contradict the model. ``strict=False`` skips these checks and the
-    exclusion of outliers, for diagnosis only; it raises CalibrationRejected only where OpenCV finds
-    no solution.
+    with the reason. ``camera``: a known one, where its fit starts; one that is fixed stays, and
+    boards may be parallel then. Features beyond 6 robust sigma are excluded, and so is a pose most
+    of whose features are. Raises CalibrationRejected where the poses cannot determine the devices:
+    too few, all parallel, or features that contradict the model. ``strict=False`` skips these
+    checks and the exclusion of outliers, for diagnosis only; it raises CalibrationRejected only
+    where OpenCV finds no solution.
     """
     excluded = dict(excluded or {})
     inliers: dict[str, Mask] = {}
@@ -184,10 +196,10 @@ def calibrate_stereo(
     check_pose_count(len(used), excluded)
     if strict:
         check_handedness(used)
-        check_tilts(used)
+        check_tilts(used, camera)
 
     for remaining in range(4, -1, -1):
-        model = _solve(used, inliers, projector_size, strict)
+        model = _solve(used, inliers, projector_size, strict, camera)
         # a diagnosis keeps all features
         outliers = _detect_outliers(model) if strict and remaining else {}
         if not outliers:
@@ -211,30 +223,75 @@ def _solve(
     inliers: Mapping[str, Mask],
     projector_size: tuple[int, int],
     strict: bool,
+    camera: KnownCamera | None,
 ) -> StereoModel:
-    """Solve each device by itself, then both together with their relative pose, from the inlier
-    features.
+    """Solve the rig from the inlier features, beside a fixed camera, or else both devices.
 
     Raises CalibrationRejected where OpenCV finds no solution or a focal length is not positive,
     and if ``strict`` where one is too uncertain.
     """
-    objects, cameras, projectors = (
-        [getattr(o, name)[inliers[o.name]].astype(np.float32) for o in used]
-        for name in ("points", "camera", "projector")
+    views = [
+        (o.points[inlier], o.camera[inlier], o.projector[inlier])
+        for o, inlier in ((o, inliers[o.name]) for o in used)
+    ]
+    if camera is not None and camera.is_fixed:
+        rig, placed, projector_sigma = solve_beside(camera, views, projector_size)
+        sigma = {"camera": camera.focal_sigma_px, "projector": projector_sigma}
+        if strict:
+            _check_focal("projector", projector_sigma, rig.projector.K)
+    else:
+        rig, placed, sigma = _solve_both(views, (used[0].size, projector_size), strict, camera)
+    poses = {o.name: T for o, T in zip(used, placed, strict=True)}
+    residuals, depths = {}, []
+    for o in used:
+        X = move_points(poses[o.name], o.points)
+        measured = np.hstack([o.camera, o.projector])
+        errors = measured - np.hstack([rig.camera.project(X), rig.project(X)])
+        residuals[o.name] = np.where(inliers[o.name][:, None], errors, np.nan)
+        depths.append(X[:, 2])
+    z = np.concatenate(depths)
+    rms = dict(zip(DEVICES, _device_rms(np.concatenate([*residuals.values()])), strict=True))
+    rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
+    return StereoModel(
+        rig=rig,
+        board="",
+        axes=("x", "y"),
+        reprojection_rms_px=rms,
+        poses=poses,
+        pose_rms_px={name: _device_rms(each) for name, each in residuals.items()},
+        excluded={},
+        depth_range_mm=(float(z.min()), float(z.max())),
+        focal_sigma_px=sigma,
+        features_excluded=int(sum((~inliers[name]).sum() for name in residuals)),
+        residuals_px=residuals,
+        fixed_camera=camera.name if camera is not None and camera.is_fixed else "",
     )
-    sizes = used[0].size, projector_size
+
+
+def _solve_both(
+    views: Views,
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+    strict: bool,
+    camera: KnownCamera | None,
+) -> tuple[StereoRig, list[Floats], dict[str, float]]:
+    """Solve each device by itself, then both together with their relative pose.
+
+    Returns the rig, T_camera_board (4, 4) mm of each pose, and the focal lengths' standard
+    deviations; raises as ``_solve``.
+    """
+    objects, cameras, projectors = (
+        [each.astype(np.float32) for each in arrays] for arrays in zip(*views, strict=True)
+    )
     sigma: dict[str, float] = {}
     intrinsics = []
-    for device, images, size in zip(DEVICES, (cameras, projectors), sizes, strict=True):
-        K, D, _, sigmas = solve_device(device, objects, images, size)
+    starts = None if camera is None else camera.lens, None
+    for device, images, size, start in zip(
+        DEVICES, (cameras, projectors), sizes, starts, strict=True
+    ):
+        K, D, _, sigmas = solve_device(device, objects, images, size, start)
         sigma[device] = max(sigmas)
-        relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
-        if strict and not relative < MAX_FOCAL_SIGMA:
-            raise CalibrationRejected(
-                f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f}"
-                " %: tilt the board by 15 to 30 degrees in different directions, and vary its"
-                " distance"
-            )
+        if strict:
+            _check_focal(device, sigma[device], K)
         intrinsics += [K, D]
     K_c, D_c, K_p, D_p = intrinsics
     alone = [np.diag(K).copy() for K in (K_c, K_p)]  # OpenCV overwrites both
@@ -262,32 +319,19 @@ def _solve(
         # systematic errors, which the standard deviations lack, change the two fits differently
         change = np.abs(f / np.diag(K) - 1).max()
         sigma[device] = max(sigma[device], float(change * min(K[0, 0], K[1, 1])))
-    camera, projector = Lens(K_c, D_c, sizes[0]), Lens(K_p, D_p, sizes[1])
-    rig = StereoRig(camera, projector, R, T)
-    poses = {o.name: transform_from_rvec(r, t) for o, r, t in zip(used, rvecs, tvecs, strict=True)}
-    residuals, depths = {}, []
-    for o in used:
-        X = move_points(poses[o.name], o.points)
-        measured = np.hstack([o.camera, o.projector])
-        errors = measured - np.hstack([camera.project(X), rig.project(X)])
-        residuals[o.name] = np.where(inliers[o.name][:, None], errors, np.nan)
-        depths.append(X[:, 2])
-    z = np.concatenate(depths)
-    rms = dict(zip(DEVICES, _device_rms(np.concatenate([*residuals.values()])), strict=True))
-    rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
-    return StereoModel(
-        rig=rig,
-        board="",
-        axes=("x", "y"),
-        reprojection_rms_px=rms,
-        poses=poses,
-        pose_rms_px={name: _device_rms(each) for name, each in residuals.items()},
-        excluded={},
-        depth_range_mm=(float(z.min()), float(z.max())),
-        focal_sigma_px=sigma,
-        features_excluded=int(sum((~inliers[name]).sum() for name in residuals)),
-        residuals_px=residuals,
-    )
+    rig = StereoRig(Lens(K_c, D_c, sizes[0]), Lens(K_p, D_p, sizes[1]), R, T)
+    return rig, [transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)], sigma
+
+
+def _check_focal(device: str, sigma_px: float, K: Floats) -> None:
+    """Raise CalibrationRejected where a focal length is too uncertain."""
+    relative = sigma_px / float(min(K[0, 0], K[1, 1]))
+    if not relative < MAX_FOCAL_SIGMA:
+        raise CalibrationRejected(
+            f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f}"
+            " %: tilt the board by 15 to 30 degrees in different directions, and vary its"
+            " distance"
+        )
 
 
 def _device_rms(residuals: Floats) -> tuple[float, float]:
@@ -337,11 +381,13 @@ def check_pose_count(count: int, excluded: Mapping[str, str]) -> None:
         )
 
 
-def check_tilts(used: Sequence[Observation]) -> None:
-    """Raise CalibrationRejected where all boards are nearly parallel.
+def check_tilts(used: Sequence[Observation], camera: KnownCamera | None = None) -> None:
+    """Raise CalibrationRejected where all boards are nearly parallel, unless the camera is fixed.
 
     Parallel boards share their vanishing line and do not determine the focal length.
     """
+    if camera is not None and camera.is_fixed:
+        return
     spread = nominal_tilt_spread_deg(used)
     if spread < MIN_TILT_SPREAD_DEG:
         raise CalibrationRejected(

@@ -177,7 +177,8 @@ class CalibrateOptions:
             validate` does.
         camera_only: Calibrate the camera's lens alone, from pictures of the board in the session,
             or in a folder in its place; the session stays as it is.
-        out: With --camera-only: write the lens to this .yml, .xml or .json, for OpenCV.
+        out: With --camera-only: write the lens to this .yml, .xml or .json, for --camera and for
+            OpenCV.
     """
 
     validate: bool = False
@@ -190,6 +191,11 @@ def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
     --validate."""
     options, json_file = take_options(arguments, CalibrateOptions), arguments.pop("json")
     if options.camera_only:
+        if arguments["camera"] is not None:
+            raise UsageError(
+                "--camera is where the calibration of a rig starts, and --camera-only makes such a"
+                " file: omit one of them"
+            )
         from slviewer.pipeline.calibrate import calibrate_camera_alone
 
         chosen = {name: arguments[name] for name in ("target", "poses", "exclude")}
@@ -204,6 +210,11 @@ def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
         result = call(calibrate, **arguments)
     data = result.to_json()
     terminal.print_result(result.text())
+    if options.camera_only and options.out is not None:
+        terminal.print_result(
+            f"written to {options.out}; next: slviewer calibrate SESSION --target"
+            f" {arguments['target']} --camera {options.out} [--fix-camera]"
+        )
     if options.validate and not options.camera_only:
         from slviewer.pipeline.accept import validate
 

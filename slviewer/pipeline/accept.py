@@ -507,7 +507,9 @@ def cross_validate(
         report = part(progress, k / len(parts), (k + 1) / len(parts))
         training = [o for o in observations if o.name not in fold]
         try:
-            without = calibrate_stereo(training, stereo.rig.projector.size, stereo.board)
+            without = calibrate_stereo(
+                training, stereo.rig.projector.size, stereo.board, camera=stereo.known_camera
+            )
         except CalibrationRejected as error:
             raise InputError(
                 f"without {', '.join(fold)} the rig cannot be calibrated, and no poses can be "

@@ -13,15 +13,23 @@ from slviewer.calibration.camera import CameraCalibration, calibrate_camera
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.evidence import Evidence
 from slviewer.calibration.diagnosis.rules import judge_evidence, judge_splined
+from slviewer.calibration.known_camera import UNSTATED_SIGMA, KnownCamera
 from slviewer.calibration.observe import Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import CalibrationRejected, DetectionError, InputError, SessionError
+from slviewer.errors import (
+    CalibrationRejected,
+    DetectionError,
+    InputError,
+    SessionError,
+    UsageError,
+)
 from slviewer.examination.light import look_at
 from slviewer.fringe.decode import texture
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.geometry.lens import Lens
 from slviewer.pipeline.capture_phases import capture_texture, convert_to_8bit, decode_or_explain
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import (
@@ -45,6 +53,7 @@ from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
 from slviewer.session.exporters import write_calibration
+from slviewer.session.importers.camera_file import read_camera_file
 from slviewer.session.importers.images import read_image
 from slviewer.session.importers.imported import images_by_name
 from slviewer.session.layout import is_session
@@ -53,6 +62,8 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
 
 SmoothingKind = Literal["spline", "polynomial"]
+LENS = "lens/camera"
+"""The session's copy of the camera's calibration that a file stated."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +80,10 @@ class CalibrateSettings:
         smoothing: How the Letter's step 2 smooths a board's phase; the spline preserves the local
             distortion.
         degree: Degree of the polynomial, with --smoothing polynomial.
+        camera: File with a calibration of the camera, where that of its lens starts: of
+            --camera-only, OpenCV, ROS, Kalibr or MATLAB.
+        fix_camera: Keep the lens of that file as it is, so that few poses of little tilt are
+            enough.
 
     ``cells_across``: cells of each of the splined model's displacement fields across its image, by
     default 26. ``replace_all``: move the session's models that are not made anew to its trash, also
@@ -84,6 +99,14 @@ class CalibrateSettings:
     degree: int = 5
     cells_across: int | None = None
     replace_all: bool = False
+    camera: Path | str | None = None
+    fix_camera: bool = False
+
+    def __post_init__(self) -> None:
+        if self.fix_camera and self.camera is None:
+            raise UsageError(
+                "--fix-camera keeps the lens of a file: name it with --camera, or omit --fix-camera"
+            )
 
     @property
     def step_2(self) -> Smoothing:
@@ -92,8 +115,15 @@ class CalibrateSettings:
 
     @property
     def method(self) -> "CalibrateSettings":
-        """The settings without the choice of models and poses."""
-        return replace(self, models=(), poses=(), exclude=(), replace_all=False)
+        """The settings without the choice of models and poses, and without the name of a file."""
+        return replace(
+            self,
+            models=(),
+            poses=(),
+            exclude=(),
+            replace_all=False,
+            camera=LENS if self.camera else None,
+        )
 
 
 @dataclass(frozen=True)
@@ -140,19 +170,23 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
         )
     before = preferred_model(store) if available_models(store) else ""
     names, excluded = _choose_poses(store, settings, job.warn)
+    first = store.load_capture(names[0])
+    camera = _load_camera(store, settings, first.size, job.warn)
     diagnosed = _diagnose_poses(
         read_stored_poses(store, names, board, settings.step_2),
         len(names),
-        store.load_capture(names[0]).sequence,
+        first.sequence,
         board,
         excluded,
         part(job.progress, 0, 0.65),
+        camera,
     )
     if diagnosed.stereo is None:
         save_verdict(store, diagnosed.verdict, names)
     result = _fit_models(diagnosed, settings, part(job.progress, 0.66, 0.97), job.warn, excluded)
     job.progress(0.97, "saving")
-    inputs = store.input_hashes(*result.stereo.poses)
+    inputs = store.input_hashes(*result.stereo.poses, *([LENS] if camera else []))
+    used = replace(settings, camera=LENS if camera else None)  # the session's own copy
     with store.together():
         if (
             result.is_rejected
@@ -162,7 +196,8 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
             made = {model.name for model in result.models}  # others would be of another calibration
             trash_models(store, [name for name in available_models(store) if name not in made])
         for model in result.models:
-            yield describe_model(model, result.verdict if model is result.stereo else None, inputs)
+            verdict = result.verdict if model is result.stereo else None
+            yield replace(describe_model(model, verdict, inputs), settings=used)
             save_compiled(store, model)
         save_verdict(store, result.verdict, names)
     if result.is_rejected:
@@ -270,6 +305,36 @@ def _changes_calibration(
     return CalibrateSettings(**before.settings).method != settings.method
 
 
+def _load_camera(
+    store: Session, settings: CalibrateSettings, size: tuple[int, int], warn: Warn
+) -> KnownCamera | None:
+    """Load the camera that the settings name for images of ``size`` (width, height) px, and save it
+    in the session, from where a repetition loads it; None where they name none."""
+    if settings.camera is None:
+        return None
+    if str(settings.camera) == LENS and store.has_result(LENS):
+        meta = store.load_result(LENS)[0]
+    else:
+        file = read_camera_file(settings.camera, size)
+        for note in file.notes:
+            warn(f"{file.name}: {note}")
+        meta = {
+            "content": file.content,
+            "name": file.name,
+            "lens": to_plain(file.lens),
+            "focal_sigma": file.focal_sigma,
+        }
+        store.save_result(LENS, meta, {})
+    lens, sigma = from_plain(meta["lens"], Lens), meta["focal_sigma"]
+    if sigma is None and settings.fix_camera:
+        warn(
+            f"{meta['name']} states no uncertainty: {100 * UNSTATED_SIGMA:g} % of the focal length"
+            " are assumed"
+        )
+    focal_sigma_px = float(lens.K[0, 0]) * (UNSTATED_SIGMA if sigma is None else sigma)
+    return KnownCamera(lens, meta["name"], settings.fix_camera, focal_sigma_px)
+
+
 def _diagnose_poses(
     poses: Iterable[Judged],
     count: int,
@@ -277,9 +342,10 @@ def _diagnose_poses(
     board: Board,
     excluded: Mapping[str, str],
     progress: Progress,
+    camera: KnownCamera | None = None,
 ) -> DiagnosedCalibration:
     """Calibrate stereo from ``count`` target poses as they are read, and judge it. ``excluded``:
-    {pose: why}."""
+    {pose: why}; ``camera``: a known one."""
     try:
         for axis in sequence.axes:
             if sequence.periods_px(axis) and sequence.find("gray", axis):
@@ -298,6 +364,7 @@ def _diagnose_poses(
         sequence.projector,
         board,
         {**excluded, **refused},
+        camera,
     )
     if result.stereo is None:
         return result
@@ -346,7 +413,7 @@ def _fit_models(
             )
             for name, why in splined.bundle.excluded.items():
                 warn(f"{name} is excluded from the splined model: it {why}")
-            verdict = judge_splined(verdict, splined.bundle.noise)
+            verdict = judge_splined(verdict, splined.bundle.noise, splined.bundle.camera)
     for finding in verdict.findings:
         if finding not in diagnosed.verdict.findings:
             warn(finding.text())

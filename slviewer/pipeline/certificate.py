@@ -308,6 +308,9 @@ class _Repetition:
                 and not stereo.excluded.get(name, "").startswith(_BY_OPERATOR)
             ]
             settings = CalibrateSettings(**record.settings)
+            if settings.camera and store.has_result(str(settings.camera)):
+                saved, arrays = store.load_result(str(settings.camera))
+                fresh.save_result(str(settings.camera), _without_own(saved), arrays)
             with self._note_failure(*results):
                 calibrate.run(fresh, replace(settings, models=models, poses=poses, exclude=()))
         else:

@@ -19,7 +19,7 @@ listed."""
 class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
     """The ``poses`` used, and why others are ``excluded``; RMS residuals of "camera", "projector"
     and "stereo", both together; focal lengths in x and y with their standard deviations, by device;
-    the nearest and the farthest board.
+    the nearest and the farthest board; the file whose lens the camera kept.
     """
 
     poses: tuple[str, ...]
@@ -30,6 +30,7 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
     baseline_mm: float
     depth_range_mm: tuple[float, float] | None = None
     features_excluded: Count = 0
+    fixed_camera: str = ""
 
     def summary(self) -> str:
         """Return the number of poses and the reprojection error in one sentence."""
@@ -70,6 +71,8 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
             else ["Made elsewhere."]
         )
         notes += [f"Excluded: {name}: {why}." for name, why in self.excluded.items()]
+        if self.fixed_camera:
+            notes.append(f"The camera is that of {self.fixed_camera}.")
         if self.features_excluded:
             notes.append(f"{self.features_excluded} features excluded beyond 6 robust sigma.")
         return Table.of(rows, "Stereo", notes)
@@ -307,5 +310,6 @@ def describe_stereo(model: Mapping[str, Any]) -> dict[str, Any]:
         },
         "baseline_mm": dist(rig["t"], (0, 0, 0)),
         "features_excluded": model.get("features_set_aside", 0),
+        "fixed_camera": model.get("fixed_camera", ""),
         **{key: model[key] for key in ("reprojection_rms_px", "focal_sigma_px", "depth_range_mm")},
     }

@@ -33,6 +33,7 @@ Cause = Literal[
     "fringe-period",
     "projector-size",
     "unreadable",
+    "camera-file",
     "board-size",
     "board-numbering",
     "moved",

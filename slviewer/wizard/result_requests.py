@@ -1,7 +1,7 @@
 """Requests to calibrate, verify, reconstruct, merge, edit, measure and export, and to choose what
 results are made from."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -56,7 +56,9 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
+from slviewer.pipeline.stored_records import load_record
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
+from slviewer.records.calibration import ModelCalibration
 from slviewer.records.measurement import MeasuredRegion
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verification import Shape
@@ -123,7 +125,8 @@ class ResultRequests(Engine):
 
     @request("Calibrating")
     def calibrate(self) -> None:
-        """Calibrate every model that the included poses allow; others go to the trash."""
+        """Calibrate every model that the included poses allow, from the same known camera as
+        before; others go to the trash."""
         target, models = self._reader.target(), ["stereo", "pixelwise"]
         if not target:
             raise InputError("choose the target first")
@@ -131,7 +134,11 @@ class ResultRequests(Engine):
             self._warner("calibration")(f"no splined model: {missing}")
         else:
             models.append("splined")
-        settings = CalibrateSettings(target, models, replace_all=True)
+        before: Mapping[str, Any] = {}
+        if "stereo" in available_models(self._store):
+            before = load_record(self._store, ModelCalibration, "stereo").settings
+        known = {key: before[key] for key in ("camera", "fix_camera") if key in before}
+        settings = CalibrateSettings(target, models, replace_all=True, **known)
         self._run("Calibrating", calibrate, settings, "calibration")
 
     @request("Comparing the models")

@@ -14,7 +14,9 @@ from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, Pose
 from slviewer.calibration.diagnosis.frames import fit_mean_turn, gamma_from_harmonic
 from slviewer.calibration.diagnosis.numbering import describe_misnumbering
 from slviewer.calibration.diagnosis.rules import judge_evidence
+from slviewer.calibration.known_camera import KnownCamera
 from slviewer.calibration.observe import Observation
+from slviewer.geometry.lens import Lens
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import CAUSES, Finding, Verdict
@@ -57,6 +59,25 @@ def plane_rms_mm(found: DiagnosedCalibration, poses: list[Observation]) -> float
         X = triangulate_pixels(found.stereo.rig, o.camera, o.projector[:, 0], "x")
         rms.append(np.linalg.svd(X - X.mean(0), full_matrices=False)[1][2] / np.sqrt(len(X)))
     return float(np.mean(rms))
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize(
+    ("factor", "level"), [(1.0, "good"), (1.005, "doubtful"), (1.2, "rejected")]
+)
+def test_a_fixed_camera_is_compared_with_the_poses(factor: float, level: str) -> None:
+    poses, true = observations(8), rig().camera
+    fx, fy, *rest = true.parameters[:9]
+    lens = Lens.from_parameters((factor * fx, factor * fy, *rest), true.size)
+    known = KnownCamera(lens, "lens.yaml", True, 0.001 * fx)
+    evidence = [PoseEvidence(o.name) for o in poses]
+    found = calibrate_with_diagnosis(poses, evidence, PROJECTOR, BOARD, camera=known)
+    assert found.verdict.level == level
+    if level != "good":
+        assert found.verdict.causes[0] == "camera-file"
+        assert not missing_facts(found.verdict.reason, "shorter", "lens.yaml", "--fix-camera")
+        assert found.evidence.camera is not None
+        assert found.evidence.camera.change == pytest.approx(1 / factor - 1, abs=0.002)
 
 
 @pytest.mark.computes

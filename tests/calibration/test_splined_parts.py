@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from splined_rig import BOARD, CELLS, aligned_error, observation, phase_map, poses, rig, surface
 
+from slviewer.calibration.known_camera import KnownCamera
+from slviewer.calibration.pinhole_fit import fit_splined
 from slviewer.calibration.splined.adjust import adjust_bundle, gather_data
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.normal import (
@@ -15,6 +17,7 @@ from slviewer.calibration.splined.normal import (
     normal_equations,
     predict_observations,
 )
+from slviewer.calibration.splined.uncertainty import summarise_volume_sigma
 from slviewer.calibration.splined.unknowns import (
     Device,
     State,
@@ -26,6 +29,7 @@ from slviewer.calibration.splined.unknowns import (
     undistort_pixel,
 )
 from slviewer.calibration.stereo import calibrate_stereo
+from slviewer.geometry.lens import Lens
 
 
 @pytest.fixture(scope="module")
@@ -261,3 +265,30 @@ def test_the_covariance_predicts_true_errors_once_rigid_motion_is_removed(model,
     predicted_rms = np.sqrt(np.mean(np.sum(spread**2, axis=0)))
     actual_rms = np.sqrt(np.mean(aligned_error(P, T) ** 2))
     assert 0.5 < predicted_rms / actual_rms < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.computes
+def test_a_held_lens_stays_and_its_error_is_found(seen, stereo, model, true) -> None:
+    # the best lens without local distortion
+    lens = fit_splined(model)[0].lens
+    fx, fy, *rest = lens.parameters[:9]
+    changes = []
+    for factor in (1.0, 1.005):
+        held = Lens.from_parameters((factor * fx, factor * fy, *rest), lens.size)
+        known = KnownCamera(held, "lens.yaml", True, 0.001 * fx)
+        start = calibrate_stereo(seen, true.projector.size, str(BOARD), camera=known)
+        bundle = adjust_bundle(seen, start, cells_across=CELLS)
+        assert np.array_equal(bundle.state.rig.camera.numbers[:9], held.parameters[:9])
+        fitted = fit_splined(SplinedModel(bundle))[0].lens  # its field does not change it either
+        assert fitted.K[0, 0] == pytest.approx(factor * fx, rel=5e-4)
+        again = SplinedModel.from_arrays(
+            SplinedModel(bundle).to_dict(), SplinedModel(bundle).to_arrays()
+        )
+        assert again.bundle.camera == bundle.camera and bundle.camera is not None
+        changes.append(bundle.camera)
+        sigma = summarise_volume_sigma(bundle).median
+        assert sigma > 1.5 * summarise_volume_sigma(model.bundle).median
+    assert abs(changes[0].change) < 1e-3 and changes[0].sigma < 5e-4
+    assert changes[1].change - changes[0].change == pytest.approx(-0.005, abs=1e-3)
+    assert changes[1].is_significant and changes[1].uncertainty > 0.003

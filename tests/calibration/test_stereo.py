@@ -8,8 +8,12 @@ import pytest
 from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
 from facts import missing_facts, raises
 
+from slviewer.calibration.known_camera import KnownCamera
+from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import MIN_POSES, StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.vectors import box_middle
 
 pytestmark = pytest.mark.computes
 
@@ -122,3 +126,36 @@ def test_exchanged_axes_are_rejected() -> None:
         o.projector[:, 0] += 40 * np.sin(np.arange(len(o.projector)))
     with pytest.raises(CalibrationRejected):
         calibrate_stereo(poses, PROJECTOR)
+
+
+def parallel_boards() -> list[Observation]:
+    """Four boards that face the camera at several distances."""
+    poses = []
+    for k, z in enumerate((480.0, 560.0, 620.0, 700.0)):
+        T = np.eye(4)
+        T[:3, 3] = np.array([8.0 * k - 12, 6.0 - 4 * k, z]) - box_middle(BOARD.points)
+        poses.append(observation(TRUE, T, f"pose_{k}", 0.02))
+    return poses
+
+
+def test_parallel_boards_are_enough_for_the_projector_beside_a_fixed_camera() -> None:
+    with raises(CalibrationRejected, "parallel"):
+        calibrate_stereo(parallel_boards(), PROJECTOR)
+    known = KnownCamera(TRUE.camera, "lens.yaml", is_fixed=True)
+    found = calibrate_stereo(parallel_boards(), PROJECTOR, camera=known)
+    assert np.array_equal(found.rig.camera.K, TRUE.camera.K) and found.fixed_camera == "lens.yaml"
+    error = abs(found.rig.projector.K[0, 0] - TRUE.projector.K[0, 0])
+    assert 1e-4 < error < 4 * found.focal_sigma_px["projector"] < 12
+    assert found.baseline_mm == pytest.approx(np.linalg.norm(TRUE.t), abs=0.5)
+    again = StereoModel.from_dict(found.to_dict()).known_camera
+    assert again is not None and again.is_fixed and again.name == "lens.yaml"
+
+
+def test_a_start_changes_nothing(model: StereoModel) -> None:
+    fx, fy, *rest = TRUE.camera.parameters[:9]
+    start = Lens.from_parameters((1.02 * fx, 1.02 * fy, *rest), TRUE.camera.size)
+    found = calibrate_stereo(
+        observations(), PROJECTOR, str(BOARD), camera=KnownCamera(start, "lens.yaml")
+    )
+    assert found.rig.camera.K[0, 0] == pytest.approx(model.rig.camera.K[0, 0], rel=1e-6)
+    assert found.known_camera is None

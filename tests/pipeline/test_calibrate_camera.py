@@ -2,15 +2,23 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from copies import copy_session
 from facts import missing_facts
 
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import p18
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
+from slviewer.pipeline.certificate import verify_report
+from slviewer.pipeline.report import report
+from slviewer.records.calibration import StereoFit
+from slviewer.session.importers.camera_file import read_camera_file
+from slviewer.session.store import Session
 from slviewer.simulation.boards import FLAT, printed_board
 from slviewer.simulation.plans import target_poses
 from slviewer.simulation.renderer import Renderer
@@ -67,3 +75,31 @@ def test_pictures_are_chosen_and_too_few_are_refused(pictures: Path, run: Run) -
     assert (
         run("calibrate", pictures, "--target", BOARD, "--camera-only", "--exclude", "none*")[0] == 2
     )
+
+
+@pytest.mark.slow
+def test_a_session_keeps_the_lens_that_was_fixed(
+    recorded: Path, pictures: Path, run: Run, tmp_path: Path
+) -> None:
+    folder, lens = copy_session(recorded / "session", tmp_path / "session"), tmp_path / "lens.yaml"
+    status, text, _ = run("calibrate", folder, "--target", BOARD, "--camera-only", "--out", lens)
+    assert status == 0 and not missing_facts(text, "--camera", str(lens), "--fix-camera")
+    settings = CalibrateSettings(str(BOARD), ("stereo",), camera=lens, fix_camera=True)
+    found = calibrate.run(folder, replace(settings, replace_all=True))["stereo"]
+    assert isinstance(found.fit, StereoFit) and found.fit.fixed_camera == "lens.yaml"
+    assert "lens/camera" in found.inputs and found.settings["camera"] == "lens/camera"
+    assert any("lens.yaml" in note for note in found.fit.table().notes)
+    known = read_camera_file(lens, RIG.camera.size)
+    assert found.fit.focal_px["camera"] == (known.lens.K[0, 0], known.lens.K[1, 1])
+    lens.unlink()
+    calibrate(folder, **found.settings)  # as the wizard does
+    page = tmp_path / "report.html"
+    report(folder, page)
+    checked = verify_report(folder, page)
+    assert {c.state for c in checked.checks if c.what == "calibration/stereo"} == {"same"}
+    with Session.open(folder, write=True) as store:
+        assert store.state_of("calibration/stereo") == "fresh"
+        meta = store.load_result("lens/camera")[0]
+        kept = {k: v for k, v in meta.items() if k not in ("hash", "arrays", "checksums")}
+        store.save_result("lens/camera", {**kept, "content": "another"}, {})
+        assert store.state_of("calibration/stereo") == "stale"

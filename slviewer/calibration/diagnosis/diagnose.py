@@ -15,6 +15,7 @@ from slviewer.calibration.diagnosis.rules import (
     reason_to_exclude,
 )
 from slviewer.calibration.diagnosis.solution import measure_solution
+from slviewer.calibration.known_camera import CameraCheck, KnownCamera
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import MIN_POSES, StereoModel, nominal_tilt_spread_deg
 from slviewer.errors import CalibrationRejected
@@ -46,12 +47,14 @@ def calibrate_with_diagnosis(
     projector: tuple[int, int],
     board: Board,
     excluded: Mapping[str, str] | None = None,
+    camera: KnownCamera | None = None,
 ) -> DiagnosedCalibration:
     """Calibrate camera and projector from the readable poses, and judge the result.
 
     ``observations``: the readable poses; ``poses``: the evidence of all poses, unreadable ones
     included; ``projector``: its (width, height) px; ``excluded``: poses excluded beforehand, with
-    the reason. A calibration that cannot be made is returned with a rejecting verdict, not raised.
+    the reason; ``camera``: a known one. A calibration that cannot be made is returned with a
+    rejecting verdict, not raised.
     """
     observations, warning = reconcile_marks(board, observations)
     readable = {o.name: o for o in observations}
@@ -67,10 +70,10 @@ def calibrate_with_diagnosis(
     refusal = ""
     stereo: StereoModel | None
     try:
-        stereo, used = calibrate_centres(fit, projector, str(board), excluded_before)
+        stereo, used = calibrate_centres(fit, projector, str(board), excluded_before, camera=camera)
     except CalibrationRejected as error:
         refusal = str(error)
-        stereo, used = _solve_unchecked(fit, projector, board, excluded_before)
+        stereo, used = _solve_unchecked(fit, projector, board, excluded_before, camera)
     evidence = Evidence(
         board=str(board),
         projector=projector,
@@ -79,6 +82,8 @@ def calibrate_with_diagnosis(
         refusal=refusal,
         tilt_spread_deg=nominal_tilt_spread_deg(fit),
         solution=None if stereo is None else measure_solution(fit, stereo),
+        is_camera_fixed=camera is not None and camera.is_fixed,
+        camera=None if stereo is None else _check_camera(used, stereo, projector, board),
     )
     verdict = judge_evidence(evidence)
     reasons = dict(stereo.excluded if stereo else excluded_before)
@@ -96,6 +101,7 @@ def _solve_unchecked(
     projector: tuple[int, int],
     board: Board,
     excluded: Mapping[str, str],
+    camera: KnownCamera | None = None,
 ) -> tuple[StereoModel | None, list[Observation]]:
     """Solve the rig without checks, for diagnosis only.
 
@@ -106,12 +112,34 @@ def _solve_unchecked(
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of boards that lie behind a device
             stereo, used = calibrate_centres(
-                observations, projector, str(board), excluded, strict=False
+                observations, projector, str(board), excluded, strict=False, camera=camera
             )
     except CalibrationRejected:
         return None, []
     is_finite = all(np.isfinite(px) for px in stereo.reprojection_rms_px.values())
     return (stereo, used) if is_finite and stereo.depth_range_mm is not None else (None, [])
+
+
+def _check_camera(
+    used: Sequence[Observation], stereo: StereoModel, projector: tuple[int, int], board: Board
+) -> CameraCheck | None:
+    """Compare a fixed camera with a calibration of both devices from the same poses; None without
+    one."""
+    known = stereo.known_camera
+    if known is None:
+        return None
+    free, _ = _solve_unchecked(used, projector, board, {}, replace(known, is_fixed=False))
+    focal = known.lens.K[0, 0]
+    stated = known.focal_sigma_px / focal
+    if free is None:
+        return CameraCheck(known.name, 0.0, np.inf, stated)
+    return CameraCheck(
+        known.name,
+        float(np.mean(np.diag(free.rig.camera.K)[:2] / np.diag(known.lens.K)[:2]) - 1),
+        free.focal_sigma_px["camera"] / focal,
+        stated,
+        (stereo.reprojection_rms_px["camera"], free.reprojection_rms_px["camera"]),
+    )
 
 
 def _select_unfit_poses(poses: Sequence[PoseEvidence], readable: Collection[str]) -> dict[str, str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.known_camera import CameraCheck
 from slviewer.calibration.stereo import MIN_TILT_SPREAD_DEG
 from slviewer.fringe.sequence import Axis
 from slviewer.records.plain import from_plain
@@ -134,7 +135,8 @@ class Evidence:
     ``board``: its notation. ``excluded``: poses excluded before the fit, with the reason.
     ``refusal``: why no calibration could be made, or why it was rejected; "" otherwise.
     ``contradiction``: why the sequence's description cannot be true, or "". ``tilt_spread_deg``:
-    the largest angle between two boards, estimated with a nominal lens.
+    the largest angle between two boards, estimated with a nominal lens. ``camera``: of a camera
+    that is fixed, how the poses agree with it.
     """
 
     board: str
@@ -145,12 +147,15 @@ class Evidence:
     contradiction: str = ""
     tilt_spread_deg: float = np.nan
     solution: SolutionEvidence | None = None
+    is_camera_fixed: bool = False
+    camera: CameraCheck | None = None
 
     @property
     def tilts_undetermined(self) -> bool:
         """Whether the boards are so nearly parallel that a fit's angles and focal lengths are
-        undetermined."""
-        return self.tilt_spread_deg < MIN_TILT_SPREAD_DEG
+        undetermined; beside a fixed camera, even parallel boards at several depths determine
+        both."""
+        return not self.is_camera_fixed and self.tilt_spread_deg < MIN_TILT_SPREAD_DEG
 
     @property
     def ripple(self) -> Mapping[Axis, Ripple]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic
+from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY, CameraCheck, judge_camera
 from slviewer.calibration.observe import AXES
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, MIN_TILT_SPREAD_DEG
@@ -26,6 +27,8 @@ COMMON_SHARE = 0.5
 """Least share of the poses with which a fault counts as common to all."""
 FEW_POSES = 6
 """A calibration from fewer poses is doubtful."""
+FEW_POSES_OF_PROJECTOR = 4
+"""The same beside a fixed camera: one pose more than the least shows which one is wrong."""
 MOTION_LIMITS_PX = (0.12, 0.3)
 """Least and largest value of the limit beyond which a board has moved."""
 _MOTION_RATIO = 5.0  # of that limit over the poses' median motion
@@ -45,7 +48,6 @@ CODE_ORIGIN_PX = 0.5
 RIPPLE_PEAK = 2.0
 """Peak of a ripple over its RMS."""
 MIN_TILT_DEG = 15.0
-MAX_FOCAL_UNCERTAINTY = 0.02
 HIGH_REPROJECTION_PX = 1.0
 DOUBTFUL_RATIO = 4.0
 """Ratio of residuals to predicted noise. It is 0.5 to 1.1 on clean simulated rigs with local
@@ -468,7 +470,8 @@ def diagnose_pose_count(e: Evidence) -> Iterator[Finding]:
     """Yield a finding where fewer poses are usable than a calibration needs."""
     usable = [pose.name for pose in e.usable if pose.name not in e.excluded]
     count = len(e.solution.used if e.solution else usable)
-    if count >= FEW_POSES:
+    needed = FEW_POSES_OF_PROJECTOR if e.is_camera_fixed else FEW_POSES
+    if count >= needed:
         return
     refused = [f"{pose.name}: {pose.refused}" for pose in e.poses if pose.refused]
     because = f" ({'; '.join(refused[:3])})" if refused else ""
@@ -476,8 +479,7 @@ def diagnose_pose_count(e: Evidence) -> Iterator[Finding]:
         "too-few-poses",
         "rejected" if count < MIN_POSES else "doubtful",
         f"{count} usable pose{'s' * (count != 1)} of {len(e.poses)}{because}",
-        f"capture the board in more positions and tilts: {FEW_POSES} at least, and a dozen is"
-        " better",
+        f"capture the board in more positions and tilts: {needed} at least, and a dozen is better",
     )
 
 
@@ -485,7 +487,7 @@ def diagnose_parallel_poses(e: Evidence) -> Iterator[Finding]:
     """Yield a finding where the boards of all poses are nearly parallel."""
     solved = None if e.tilts_undetermined else e.solution
     spread = solved.tilt_spread_deg if solved else e.tilt_spread_deg
-    if not spread < MIN_TILT_DEG or len(e.usable) < MIN_POSES:
+    if e.is_camera_fixed or not spread < MIN_TILT_DEG or len(e.usable) < MIN_POSES:
         return
     rejected = spread < MIN_TILT_SPREAD_DEG or solved is None or bool(e.refusal)
     yield Finding(
@@ -538,6 +540,7 @@ STAGES: tuple[tuple[Callable[[Evidence], Iterator[Finding]], ...], ...] = (
     (diagnose_frame_order, diagnose_saturation),
     (diagnose_mirroring, diagnose_period, diagnose_description, diagnose_board_size),
     (
+        lambda e: judge_camera(e.camera),
         diagnose_single_poses,
         diagnose_gamma,
         diagnose_ripple,
@@ -562,12 +565,15 @@ def judge_evidence(evidence: Evidence) -> Verdict:
     return Verdict.of(findings)
 
 
-def judge_splined(verdict: Verdict, noise: Noise) -> Verdict:
-    """Return the verdict with a finding added where the joint adjustment's residuals exceed their
-    predicted noise.
+def judge_splined(verdict: Verdict, noise: Noise, camera: CameraCheck | None = None) -> Verdict:
+    """Return the verdict with findings added where the joint adjustment's residuals exceed their
+    predicted noise, and where it contradicts a fixed camera.
 
-    The finding names the first of ``EXPLAINING_CAUSES`` among the others as its probable cause.
+    The former names the first of ``EXPLAINING_CAUSES`` among the others as its probable cause.
     """
+    if camera is not None:
+        others = [finding for finding in verdict.findings if finding.cause != "camera-file"]
+        verdict = Verdict.of([*others, *judge_camera(camera)])
     ratio, px, axis = max(zip(noise.ratio, noise.sample_px, "xy", strict=True))
     if ratio < DOUBTFUL_RATIO:
         return verdict

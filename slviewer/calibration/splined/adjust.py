@@ -14,6 +14,7 @@ from slviewer.calibration.splined.half_turns import (
     is_numbering_ambiguous,
     renumber_poses,
 )
+from slviewer.calibration.splined.held_camera import HeldLens
 from slviewer.calibration.splined.normal import (
     BlockFactor,
     ObservedValues,
@@ -108,7 +109,9 @@ def adjust_bundle(
     names, data, sample_sigma = gather_data(observations, stereo)
     T = np.array([stereo.poses[name] for name in names])
     state = State.from_rig(stereo.rig, T, len(data.points), cells_across)
-    layout, prior = state.layout, Prior.build(state, data.points)
+    layout = state.layout
+    held = HeldLens(stereo.known_camera, state.rig.camera, data.sample_px, layout.rig)
+    prior = Prior.build(state, data.points, held.gauge)
     is_excluded = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
     certain = np.array(
@@ -133,6 +136,7 @@ def adjust_bundle(
                 w[is_excluded[pose]] = 0.0
             A, b = normal_equations(state, data, residuals, weights)
             prior.add(A, b, state)
+            held.take(A, b)
             factor = BlockFactor(A, layout)
             count = int(sum(np.count_nonzero(w) for w in weights))
             system = A, b, factor.solve(b)
@@ -173,6 +177,7 @@ def adjust_bundle(
         z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
         z = (z + state.t_board[pose, 2])[~is_excluded[pose]]
         camera_poses, projector_poses = _count_poses(state, weights[1], data)
+        check = held.release(A, b, factor)
         rig_factor = factorize(A)[layout.rig :, layout.rig :]
         return Bundle(
             state=state,
@@ -188,6 +193,7 @@ def adjust_bundle(
             packed_factor=rig_factor[np.tri(len(rig_factor), dtype=bool)].astype(np.float32),
             steps=step,
             half_turned_poses=tuple(np.array(names)[half_turned].tolist()),
+            camera=check,
         )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solve_triangular
 
+from slviewer.calibration.known_camera import CameraCheck
 from slviewer.calibration.splined.normal import (
     dense_columns,
     fill_sample_fields,
@@ -50,7 +51,7 @@ class Bundle:
     1/px^2: of the camera's and the projector's prior. ``excluded``: poses not used, with the
     reason. ``camera_poses`` and ``projector_poses``: how many poses illuminated each cell of the
     fields (rows, columns). ``half_turned_poses``: poses whose numbering was corrected by half a
-    turn.
+    turn. ``camera``: of one that was held, how the poses agree with it.
 
     ``packed_factor``: the lower triangle of ``factor``, row by row, float32.
     """
@@ -68,6 +69,7 @@ class Bundle:
     packed_factor: Floats32
     steps: int
     half_turned_poses: tuple[str, ...] = ()
+    camera: CameraCheck | None = None
 
     @cached_property
     def factor(self) -> Floats32:

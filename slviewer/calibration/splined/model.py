@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.known_camera import CameraCheck
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.calibration.splined.adjust import adjust_bundle
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
@@ -239,6 +240,7 @@ class SplinedModel:
         data: dict[str, Any] = to_plain(
             {key: getattr(bundle, key) for key in keys}
             | {"turned": bundle.half_turned_poses, "left_out": bundle.excluded}
+            | ({"camera": bundle.camera} if bundle.camera else {})
         )
         return data
 
@@ -277,6 +279,7 @@ class SplinedModel:
             packed_factor=a["factor"],
             steps=data["steps"],
             half_turned_poses=tuple(data.get("turned", ())),
+            camera=from_plain(data["camera"], CameraCheck) if "camera" in data else None,
         )
         return cls(bundle)
 

@@ -25,6 +25,7 @@ from slviewer.calibration.splined.residuals import (
 )
 from slviewer.calibration.splined.unknowns import (
     GAUGE_MM,
+    GAUGE_PX,
     HEIGHT_SIGMA_MM,
     HEIGHT_TERMS,
     OFFSET_SIGMA_MM,
@@ -119,19 +120,21 @@ class Prior:
     widely.
 
     ``features_per_point``: how many of the board's features each offset of the state represents.
+    ``camera_gauge``: unit rows of what the camera's field lacks, where its lens is held.
     """
 
     forms: tuple[Floats, Floats]
     gauge: Floats
+    camera_gauge: Floats | None = None
     strengths: tuple[float, float] = (FIRST_STRENGTH, FIRST_STRENGTH)
     features_per_point: float = 1.0
 
     @classmethod
-    def build(cls, state: State, points: Floats) -> "Prior":
+    def build(cls, state: State, points: Floats, camera_gauge: Floats | None = None) -> "Prior":
         """Build the prior for the fields' knots and the board's features at ``points`` (f, 3)
         mm."""
         camera, projector = (roughness(device.coefficients) for device in state.rig[:2])
-        return cls((camera, projector), offset_gauge(points))
+        return cls((camera, projector), offset_gauge(points), camera_gauge)
 
     def add(self, A: Floats, b: Floats, state: State) -> None:
         """Add to the upper triangle and the right-hand side."""
@@ -153,6 +156,9 @@ class Prior:
                 block = slice(first + k * n, first + (k + 1) * n)
                 A[block, block] += strength * form
                 b[block] -= strength * (form @ field[k])
+        if self.camera_gauge is not None:
+            block = slice(at.camera_field, at.projector_field)
+            A[block, block] += self.camera_gauge.T @ self.camera_gauge / GAUGE_PX**2
 
     def cost(self, state: State) -> float:
         """Half the prior's chi square at a state."""

@@ -43,6 +43,8 @@ OFFSET_SIGMA_MM = 0.03
 GAUGE_MM = 1e-6
 """How nearly the offsets' common shift, turn and growth are held at nothing: the poses and the
 pitch have those."""
+GAUGE_PX = 1e-6
+"""The same of what a held lens has, in the camera's field."""
 LENS = 9
 """fx fy cx cy k1 k2 p1 p2 k3."""
 RIG = 2 * LENS + 6

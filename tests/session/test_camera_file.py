@@ -1,0 +1,130 @@
+"""A camera's lens from files that other programs write."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from facts import missing_facts
+
+from slviewer.errors import InputError
+from slviewer.geometry.lens import Lens
+from slviewer.session.importers.camera_file import read_camera_file
+
+SIZE = (400, 300)
+K = np.array([[890.0, 0, 199.5], [0, 889.0, 148.5], [0, 0, 1]])
+D = np.array([-0.1, 0.05, 0.001, -0.002, 0.01])
+SAMPLE = {
+    "image_width": 400, "image_height": 300, "fisheye_model": 0, "camera_matrix": K,
+    "distortion_coefficients": D[:, None], "per_view_reprojection_errors": np.ones((10, 1)),
+}  # fmt: skip
+ROS = {
+    "image_width": 400,
+    "image_height": 300,
+    "camera_matrix": {"rows": 3, "cols": 3, "data": K.ravel().tolist()},
+    "distortion_model": "plumb_bob",
+    "distortion_coefficients": {"rows": 1, "cols": 5, "data": D.tolist()},
+    "projection_matrix": {"rows": 3, "cols": 4, "data": [0.0] * 12},
+}
+CAM0 = {
+    "camera_model": "pinhole",
+    "distortion_coeffs": D[:4].tolist(),
+    "distortion_model": "radtan",
+    "intrinsics": [890.0, 889.0, 199.5, 148.5],
+    "resolution": [400, 300],
+}
+MATLAB = {  # rows first, pixels counted from 1, and the matrix transposed
+    "ImageSize": [300, 400],
+    "IntrinsicMatrix": [[890.0, 0, 0], [0, 889.0, 0], [200.5, 149.5, 1]],
+    "RadialDistortion": [-0.1, 0.05, 0.01],
+    "TangentialDistortion": [0.001, -0.002],
+}
+
+
+def opencv(path: Path, entries: dict[str, Any]) -> Path:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in entries.items():
+        storage.write(key, value)
+    storage.release()
+    return path
+
+
+def text(path: Path, entries: dict[str, Any]) -> Path:
+    dump = json.dumps if path.suffix == ".json" else yaml.safe_dump
+    path.write_text(dump(entries))
+    return path
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("write", "name", "entries"),
+    [
+        (opencv, "a.yml", SAMPLE),
+        (opencv, "a.xml", {"Camera_Matrix": K, "Distortion_Coefficients": D, "image_Width": 400,
+                           "image_Height": 300}),
+        (text, "ros.yaml", ROS),
+        (text, "camchain.yaml", {"cam0": CAM0}),
+        (text, "matlab.json", {"cameraParams": MATLAB}),
+        (text, "matlab.yaml", {**MATLAB, "FocalLength": [890.0, 889.0]}),
+    ],
+)  # fmt: skip
+def test_a_lens_is_read(
+    write: Callable[[Path, dict[str, Any]], Path],
+    name: str,
+    entries: dict[str, Any],
+    tmp_path: Path,
+) -> None:
+    found = read_camera_file(write(tmp_path / name, entries), SIZE)
+    np.testing.assert_allclose(found.lens.K, K)
+    np.testing.assert_allclose(found.lens.D[:4], D[:4])
+    assert found.lens.size == SIZE and found.notes == () and found.focal_sigma is None
+
+
+@pytest.mark.process
+def test_a_lens_of_larger_images_is_scaled(tmp_path: Path) -> None:
+    large = Lens(K, D, SIZE).resize(4)
+    entries = {**SAMPLE, "camera_matrix": large.K, "image_width": 1600, "image_height": 1200}
+    found = read_camera_file(opencv(tmp_path / "a.yml", entries), SIZE)
+    np.testing.assert_allclose(found.lens.K, K)
+    assert len(found.notes) == 1 and not missing_facts(found.notes[0], "1600x1200", "400x300")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("changed", "facts"),
+    [
+        ({"image_width": 1600}, ("1600x300", "400x300")),
+        ({"fisheye_model": 1}, ("fisheye_model",)),
+        ({"distortion_coefficients": np.full((8, 1), 0.1)}, ("8",)),
+        ({"camera_matrix": np.array([[8.0, 0, 2], [0, 8, 1.5], [0, 0, 1]])}, ("8", "mm", "400")),
+        ({"camera_matrix": np.eye(2)}, ("camera_matrix", "3x3")),
+    ],
+)
+def test_a_lens_that_does_not_fit_is_refused(
+    changed: dict[str, Any], facts: tuple[str, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError) as caught:
+        read_camera_file(opencv(tmp_path / "a.yml", {**SAMPLE, **changed}), SIZE)
+    assert missing_facts(str(caught.value), "a.yml", *facts) == []
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("entries", "facts"),
+    [
+        ({**ROS, "distortion_model": "equidistant"}, ("equidistant",)),
+        ({"cam0": {**CAM0, "camera_model": "omni"}}, ("omni",)),
+        ({"cam0": CAM0, "cam1": CAM0}, ("cam0", "cam1")),
+        ({"camera_matrix": (4 * K).tolist()}, ("798", "400x300")),
+    ],
+)
+def test_other_models_and_several_cameras_are_refused(
+    entries: dict[str, Any], facts: tuple[str, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError) as caught:
+        read_camera_file(text(tmp_path / "a.yaml", entries), SIZE)
+    assert missing_facts(str(caught.value), *facts) == []
