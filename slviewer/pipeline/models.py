@@ -129,7 +129,7 @@ def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:
     states none."""
     if "model" in meta:
         return StereoModel.from_dict(meta["model"])
-    captures = store.captures()
+    captures = [each for each in store.captures() if not each.is_imported_cloud]
     if not captures and not (meta["camera"] and meta["projector"]):
         raise SessionError(
             f"{store.folder} holds no capture that states the camera's size: import the scans first"
@@ -167,7 +167,8 @@ def load_stereo_if_complete(store: Session) -> StereoModel | None:
     if "stereo" not in available_models(store):
         return None
     meta = store.load_result("calibration/stereo", only=())[0]
-    sized = "model" in meta or (meta["camera"] and meta["projector"]) or store.captures()
+    sized = "model" in meta or (meta["camera"] and meta["projector"])
+    sized = sized or any(not each.is_imported_cloud for each in store.captures())
     return load_stereo(store) if sized else None
 
 
@@ -348,6 +349,8 @@ def frame_family(name: str) -> str:
 
 def frame_of(store: Session, name: str) -> str:
     """The frame of a model's clouds, in words: "camera of calibration splined 1a2b3c4d"."""
+    if not name:
+        return "imported file"
     family = frame_family(name)
     calibration = f"calibration/{family}"
     if not store.has_result(calibration):
