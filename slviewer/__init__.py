@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from slviewer.pipeline.compare import compare
     from slviewer.pipeline.export import export
     from slviewer.pipeline.import_captures import import_captures, read_captures
+    from slviewer.pipeline.import_cloud import import_cloud
     from slviewer.pipeline.inspect_parts import run_plan
     from slviewer.pipeline.measure import measure
     from slviewer.pipeline.merge import align, merge
@@ -153,8 +154,8 @@ __all__ = [
     "SlviewerError", "Verification", "accept", "align", "align_clouds", "batch", "calibrate",
     "calibrate_frames", "capture", "capture_frames", "check", "compare", "complementary",
     "datasets", "decode", "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere",
-    "examine", "export", "fuse_clouds", "gray", "import_captures", "letter_rig", "load_arrays",
-    "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro",
+    "examine", "export", "fuse_clouds", "gray", "import_captures", "import_cloud", "letter_rig",
+    "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro",
     "multifrequency", "one_axis", "p18", "plugins", "read_captures", "read_ply", "reconstruct",
     "reconstruct_cloud", "report", "run_plan", "save_calibration", "simulate", "simulated_rig",
     "texture", "verify", "write_ply",

@@ -13,6 +13,7 @@ from tyro.conf import Positional
 
 from slviewer import terminal
 from slviewer.commands.command import (
+    JSON,
     Arguments,
     Command,
     Function,
@@ -416,10 +417,11 @@ def make_import_command() -> Command:
             "file",
             run=run_import_calibration,
         ),
+        "cloud": read_command("pipeline.import_cloud:import_cloud", "files", options=JSON),
     }
 
     def import_command(command: Any) -> Work:
-        """Import captures or calibrations that other tools made."""
+        """Import captures, calibrations or clouds that other tools made."""
         return command  # type: ignore[no-any-return]
 
     for name in sorted(set(list_names(IMPORTERS)) - layouts.keys()):

@@ -105,6 +105,7 @@ def deviation(
     reach_mm: float | None = None,
     initial: Floats | None = None,
     progress: Progress | None = None,
+    has_camera: bool = True,
 ) -> Deviation:
     """Align scan points (n, 3) mm with a nominal model, and return the signed distance of each.
 
@@ -112,7 +113,8 @@ def deviation(
     than the nominal is excluded by them. ``sigma_mm``: the expected error of one point.
     ``reach_mm``: points farther off the nominal belong to something else; by default 2 % of its
     diagonal, never below ten times the noise. ``initial`` (4, 4) scan to nominal: replaces the
-    search. Raises SlviewerError where the two cannot be aligned with trust.
+    search. ``has_camera``: whether the scan was seen from its origin. Raises SlviewerError where
+    the two cannot be aligned with trust.
     """
     report = progress or (lambda share: None)
     points = np.asarray(points, np.float64)
@@ -128,7 +130,9 @@ def deviation(
     report(0.0)
     start = None
     if initial is None:
-        start = search_start(points, normals, surface, sigma_mm, lambda share: report(0.6 * share))
+        start = search_start(
+            points, normals, surface, sigma_mm, lambda share: report(0.6 * share), has_camera
+        )
         initial = start.T_reference_scan
     T, alignment, spread = _refine_best_fit(
         points, normals, surface, initial, reach_mm, lambda share: report(0.6 + 0.2 * share)

@@ -1,5 +1,6 @@
 """A nominal model: signed distances of points from it, and initial alignment of a scan to it."""
 
+from contextlib import suppress
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -133,17 +134,22 @@ def search_start(
     surface: NominalSurface,
     sigma_mm: float | None,
     report: Progress,
+    has_camera: bool = True,
 ) -> Registration:
     """The scan (n, 3) registered to the nominal.
 
-    A scan shows one side of a part: the nominal is tried as a camera sees it from each of
-    `VIEWS`, until one fits well; else the best that is accepted. Raises the first refusal where
-    none is.
+    A scan that ``has_camera`` shows one side of a part: the nominal is tried as a camera sees it
+    from each of `VIEWS`, until one fits well; else the best that is accepted. Raises the first
+    refusal where none is.
     """
     places, facing = surface.sample(SAMPLES)
     if normals is not None:
         normals = subsample(normals, MAX_POINTS)
-    scan = prepare_scan("scan", subsample(points, MAX_POINTS), normals, sigma_mm)
+    scan = prepare_scan("scan", subsample(points, MAX_POINTS), normals, sigma_mm, has_camera)
+    if not has_camera:
+        whole = prepare_scan("nominal model", places, facing, has_camera=False)
+        with suppress(SlviewerError):  # it may show one side all the same
+            return _register_symmetric(scan, whole)
     good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
     refusal: SlviewerError | None = None
     best: Registration | None = None

@@ -244,6 +244,8 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     decision, or was made elsewhere.
     """
     store, capture = job.store, settings.capture
+    if capture in store.taken_names():
+        store.load_capture(capture).require_frames("check")
     stereo = load_stereo(store)
     if not stereo.poses:
         raise InputError(

@@ -235,7 +235,9 @@ def list_captures(address: str, task: Task) -> list[str]:
     _check_version(task)
     patterns = task.settings.captures
     with _fetch_session(address) as folder, Session.open(folder) as store:
-        there = store.capture_names(None if patterns else "scan")
+        there = store.capture_names()
+        if not patterns:
+            there = [c.name for c in store.captures("scan") if not c.is_imported_cloud]
     names = [name for name in there if any(fnmatchcase(name, each) for each in patterns or "*")]
     if not names:
         raise InputError(

@@ -285,6 +285,9 @@ class _Repetition:
             _link(store.load_capture(name).folder, fresh.folder / "captures" / name)
         for name in fresh.capture_names("scan"):
             save_edits(fresh, name, load_edits(store, name))
+            if (capture := fresh.load_capture(name)).is_imported_cloud:
+                saved, arrays = store.load_result(f"clouds/{capture.name}")
+                fresh.save_result(f"clouds/{name}", _without_own(saved), arrays)
         save_region(fresh, load_region(store))
         if (store.folder / NOMINALS).is_dir():
             _link(store.folder / NOMINALS, fresh.folder / NOMINALS)

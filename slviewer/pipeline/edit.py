@@ -131,6 +131,11 @@ def edit_scan(settings: EditSettings) -> ScanEdits:
             check_accepted(store, settings.accept_rejected)
             job, plane = Job(store, settings.progress, settings.warn), None
             cloud = scan_cloud(job, scan, settings.model, settings.accept_rejected)
+            if cloud.normals is not None:
+                raise InputError(
+                    f"{scan} was imported as a cloud, whose points are not those of pixels: cut it"
+                    " with --roi where it is used, or before it is imported"
+                )
             if settings.support:
                 plane, selected = select_support(cloud.points, cloud.sigma_z, settings.margin)
                 what = SUPPORT

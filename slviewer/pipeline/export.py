@@ -33,7 +33,7 @@ from slviewer.pipeline.scan_edits import resolve_region, restriction_notes
 from slviewer.pipeline.stored_records import SessionLike, Stored, list_records, opened
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.kinds import RECORDS
 from slviewer.records.merge import Merge
 from slviewer.records.table import Value
@@ -513,7 +513,7 @@ def _write_shape(store: Session, name: str, target: Path, settings: ExportSettin
         return f"{whose}: {'; '.join(made)}"
     if is_scan:
         progress(0.56, "normals")
-        normals, rgb = grid_normals(cloud.points)[mask], cloud.rgb
+        normals, rgb = cloud_normals(cloud)[mask], cloud.rgb
         points = PointSet(cloud.measured, normals, None if rgb is None else rgb[mask])
         scalars, sigma = cloud.sigmas(mask), "sigma: expected error of the depth, mm"
     else:

@@ -409,6 +409,7 @@ def fit_to_nominal(
         sigma_mm=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None,
         reach_mm=reach_mm,
         progress=progress,
+        has_camera=bool(surface.model),
     )
 
 

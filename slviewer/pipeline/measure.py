@@ -18,7 +18,6 @@ from slviewer.inspection.section import CutPlane, section, triangulate_near
 from slviewer.inspection.uncertainty import PointErrors, Spread, splined_shared
 from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
-    Model,
     ModelName,
     available_models,
     check_accepted,
@@ -55,6 +54,7 @@ from slviewer.session.atomic import replace_file
 from slviewer.session.names import clean_label
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
+from slviewer.surface.unorganised import point_set
 
 What = Literal["point", "distance", "section", "plane", "sphere", "cylinder"]
 FITTED = ("plane", "sphere", "cylinder")
@@ -179,23 +179,26 @@ def load_surface(
         return load(store)
     if scan.startswith(MERGED):
         return load_merged_surface(store, scan, warn, roi)
-    check_accepted(store, accept_rejected)
-    warn_if_stale(store, warn)
-    model = model or preferred_model(store)
+    if not store.load_capture(scan).is_imported_cloud:
+        check_accepted(store, accept_rejected)
+        warn_if_stale(store, warn)
+        model = model or preferred_model(store)
     cloud = scan_cloud(job, scan, model, accept_rejected, roi)
     job.progress(1.0, "reconstructed")
-    return surface_from_cloud(
-        store, scan, cloud, load_model(store, cloud.model), with_region=not roi
-    )
+    return surface_from_cloud(store, scan, cloud, with_region=not roi)
 
 
 def surface_from_cloud(
-    store: Session, scan: str, cloud: Cloud, fitted: Model, *, with_region: bool = True
+    store: Session, scan: str, cloud: Cloud, *, with_region: bool = True
 ) -> MeasuredSurface:
-    """A capture's cloud, made with one of the session's calibrations, as a surface to measure on.
-
-    ``with_region``: whether it was cut by the session's region, where that is in effect.
-    """
+    """A capture's cloud as a surface to measure on; ``with_region``: whether it was cut by the
+    session's region, where that is in effect."""
+    if cloud.normals is not None:
+        on, used = point_set(cloud), restriction_inputs(store, [scan], with_region=with_region)
+        known: dict[str, Any] = {"normals": on.normals, "texture": on.colours}
+        known |= {"sigma_mm": on.sigma_mm, "inputs": store.input_hashes(scan) | used}
+        return MeasuredSurface(on.points, source=scan, model="", **known)
+    fitted = load_model(store, cloud.model)
     calibration, scale, sigma = f"calibration/{fitted.name}", 1.0, 0.0
     names = [scan, calibration]
     if (applied := load_scale_correction(store, fitted.name)) is not None:
@@ -356,7 +359,9 @@ def uncertainty_notes(store: Session, measured: Measurement) -> tuple[str, ...]:
     models = [each for each in measured.model.split(", ") if each != "splined"]
     cause = f"the model {' or '.join(models)}"
     remedy = "measure with the splined model (--model splined)"
-    if any(source.startswith(MERGED) for source in measured.source.split(", ")):
+    if "" in models:
+        cause, remedy = "an imported cloud", "measure an artefact of known size with its scanner"
+    elif any(source.startswith(MERGED) for source in measured.source.split(", ")):
         cause = "a merge"
         remedy = "measure on one of its scans with the splined model (--model splined)"
     elif "splined" not in available_models(store):
@@ -463,7 +468,7 @@ def relate(job: Job, settings: RelateSettings) -> Iterator[Found[Measurement]]:
     a, b = first.record, second.record
     # scans are in one frame only while camera and calibration are the same; a merge has its own
     scans = {a.source, b.source} <= set(store.capture_names())
-    if a.source != b.source and (a.model != b.model or not scans):
+    if a.source != b.source and (a.model != b.model or not (a.model and scans)):
         raise InputError(
             f"{first.label} was measured on {a.source} with {a.model}, {second.label} on {b.source}"
             f" with {b.model}: they do not lie in one frame; measure both on one surface"

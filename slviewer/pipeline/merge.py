@@ -27,7 +27,7 @@ from slviewer.pipeline.scale import describe_calibration
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.pipeline.stored_records import next_name, placed_file, read_record
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.reconstruction.reconstruct import normals
+from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.merge import (
     ContradictingPair,
     MarkerPair,
@@ -189,15 +189,10 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     table_deg = _list_table_angles(store, settings)
     starts = _initial_alignments(job, settings, table_deg)
     check_accepted(store, settings.accept_rejected)
-    fitted = load_model(store, settings.model)
     warn_if_stale(store, warn)
-    region = resolve_region(store, settings.roi)
-    restrictions = restriction_notes(store, names, region)
+    restrictions = restriction_notes(store, names, resolve_region(store, settings.roi))
     inputs = restriction_inputs(store, names, with_region=not settings.roi)
-    clouds, accepts = dict[str, Cloud](), settings.accept_rejected
-    reading = replace(job, progress=part(job.progress, 0.0, 0.4))
-    for shot, _, cloud in reconstruct_captures(reading, fitted, names, accept_rejected=accepts):
-        clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
+    model, clouds = _read_clouds(replace(job, progress=part(job.progress, 0.0, 0.4)), settings)
     if settings.start == "markers" or table_deg is not None:
         markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
         if table_deg is None:
@@ -214,12 +209,24 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     progress = stage(job.progress, 0.75, 0.9, "fusing")
     fused = fuse(clouds, alignment.T_reference_scan, progress, alignment.uncertainties)
     job.progress(0.9, "writing")
-    used = describe_calibration(store, fitted.name, fused.names)
+    used = describe_calibration(store, model, fused.names)
     used["inputs"] |= inputs
     record = _make_record(registered, fused, restrictions=list(restrictions), **used)
     with _write_merge(store, settings, fused, record) as found:
         yield MergedScans(alignment, fused, clouds, found)
     job.progress(1.0, "merged")
+
+
+def _read_clouds(job: Job, settings: MergeSettings) -> tuple[str, dict[str, Cloud]]:
+    """Return the calibration's name, "" where all scans were imported, and the scans' clouds."""
+    store, names, roi = job.store, settings.names, settings.roi
+    model, clouds, region = "", dict[str, Cloud](), resolve_region(store, roi)
+    if own := [n for n in names if not store.load_capture(n).is_imported_cloud]:
+        fitted = load_model(store, settings.model)
+        made = reconstruct_captures(job, fitted, own, accept_rejected=settings.accept_rejected)
+        clouds = {shot.name: restrict_cloud(store, shot.name, c, region) for shot, _, c in made}
+        model = fitted.name
+    return model, {n: clouds[n] if n in own else scan_cloud(job, n, roi=roi) for n in names}
 
 
 @contextmanager
@@ -499,7 +506,7 @@ def _align_scan(
     """
     store, refusals = job.store, list[str]()
     cloud = _load_cloud(store, name, clouds, job.warn)
-    inputs = store.input_hashes(name, "calibration/stereo", f"calibration/{cloud.model}")
+    inputs = describe_calibration(store, cloud.model, [name])["inputs"]
     if not placed:
         return Placement(T_first_scan=to_matrix(np.eye(4)), inputs=inputs)
     for onto in [*reversed(list(placed))][:MOST_TRIED]:
@@ -558,7 +565,7 @@ def view_places(
     trees, facing = [], [np.zeros(0)]
     for name, each in placed.items():
         cloud = _load_cloud(store, name, clouds, ignore_warnings)
-        points, directions = cloud.measured, choose_pixels(normals(cloud.points), cloud.mask)
+        points, directions = cloud.measured, choose_pixels(cloud_normals(cloud), cloud.mask)
         step = max(1, len(points) // _SHOWN_POINTS)
         points, directions = points[::step], directions[::step]
         trees.append(cKDTree(move_points(np.array(each.T_first_scan), points)))
@@ -588,5 +595,6 @@ def _load_cloud(store: Session, name: str, clouds: dict[str, Cloud], warn: Warn)
         cloud = scan_cloud(Job(store, warn=warn), name)
         step = max(1, int(np.ceil(np.sqrt(cloud.sigma_z.size / _PIXELS))))
         points, sigma_z = cloud.points[::step, ::step], cloud.sigma_z[::step, ::step]
-        clouds[name] = Cloud(points, cloud.axis, cloud.model, sigma_z)
+        facing = None if cloud.normals is None else cloud.normals[::step, ::step]
+        clouds[name] = Cloud(points, cloud.axis, cloud.model, sigma_z, normals=facing)
     return clouds[name]

@@ -206,6 +206,9 @@ def _textured_scans(
 ) -> tuple[Mapping[str, Cloud], Mapping[str, np.ndarray]]:
     """Return the cloud of every scan that the mesh is made of, and its pose (4, 4) in the mesh's
     frame."""
+    for name in settings.sources:
+        if not name.startswith(MERGED):
+            store.load_capture(name).require_frames("texture")
     if merged is not None:
         clouds = {name: merged.clouds[name] for name in merged.fused.names}
         return clouds, merged.alignment.T_reference_scan
@@ -213,6 +216,8 @@ def _textured_scans(
     if isinstance(shape, Cloud):
         return {source: shape}, {source: np.eye(4)}
     made = load_record(store, Merge, merge_name(store, source.removeprefix(MERGED)))
+    for name in made.scans:
+        store.load_capture(name).require_frames("texture")
     placed = {made.reference: np.eye(4)}
     placed |= {name: np.array(pair.T_reference_scan) for name, pair in made.pairs.items()}
     used = made.model or settings.model

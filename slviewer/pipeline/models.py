@@ -130,8 +130,10 @@ def load_stereo(store: Session) -> StereoModel:
 def lens_warnings(store: Session, capture: Capture) -> tuple[str, ...]:
     """Return a sentence for each of focus, zoom and aperture that the camera reported otherwise
     than for the calibration's poses."""
+    if not capture.lens:
+        return ()
     inputs = store.load_result("calibration/stereo", only=())[0]["inputs"]
-    names = inputs.keys() & set(store.capture_names("calibration")) if capture.lens else ()
+    names = inputs.keys() & set(store.capture_names("calibration"))
     poses = [pose for name in names if (pose := store.load_capture(name)).hash == inputs[name]]
     warnings = []
     for what, value in capture.lens.items():
@@ -152,7 +154,7 @@ def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:
     states none."""
     if "model" in meta:
         return StereoModel.from_dict(meta["model"])
-    captures = store.captures()
+    captures = [each for each in store.captures() if not each.is_imported_cloud]
     if not captures and not (meta["camera"] and meta["projector"]):
         raise SessionError(
             f"{store.folder} holds no capture that states the camera's size: import the scans first"
@@ -190,7 +192,8 @@ def load_stereo_if_complete(store: Session) -> StereoModel | None:
     if "stereo" not in available_models(store):
         return None
     meta = store.load_result("calibration/stereo", only=())[0]
-    sized = "model" in meta or (meta["camera"] and meta["projector"]) or store.captures()
+    sized = "model" in meta or (meta["camera"] and meta["projector"])
+    sized = sized or any(not each.is_imported_cloud for each in store.captures())
     return load_stereo(store) if sized else None
 
 
@@ -371,6 +374,8 @@ def frame_family(name: str) -> str:
 
 def frame_of(store: Session, name: str) -> str:
     """The frame of a model's clouds, in words: "camera of calibration splined 1a2b3c4d"."""
+    if not name:
+        return "imported file"
     family = frame_family(name)
     calibration = f"calibration/{family}"
     if not store.has_result(calibration):

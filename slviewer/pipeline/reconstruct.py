@@ -117,6 +117,7 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
     """Context manager: a reconstructed capture, not stored yet; its file gets its place at the
     end."""
     store, capture, warn = job.store, settings.capture, job.warn
+    store.load_capture(capture).require_frames("reconstruct")
     check_accepted(store, settings.accept_rejected)
     name = settings.model or preferred_model(store)
     warn_if_stale(store, warn)
@@ -361,6 +362,8 @@ def verify(
 def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCapture]:
     """Yield the comparison of models on each capture."""
     store, names = job.store, settings.captures
+    for name in names:
+        store.load_capture(name).require_frames("verify")
     chosen = load_models(store, settings.models)
     check_accepted(store, settings.accept_rejected)
     warn_if_stale(store, job.warn)
@@ -405,6 +408,7 @@ def check_capture_sizes(store: Session, names: Iterable[str]) -> None:
     it."""
     rig = load_stereo(store).rig
     for capture in (store.load_capture(name) for name in names):
+        capture.require_frames("reconstruct")
         check_sizes(capture.name, capture.size, capture.sequence.projector_size, rig)
 
 
@@ -531,17 +535,20 @@ def reconstruct_captures(
 def scan_cloud(
     job: Job, name: str, model: str | None = None, accept_rejected: bool = False, roi: str = ""
 ) -> Cloud:
-    """A capture's cloud: the stored one where it is up to date and of the requested model, else
-    reconstructed; without what was deleted from it, and what lies outside of the region ``roi``, as
-    `resolve_region` reads it.
+    """A capture's cloud: the stored one where it was imported, or is up to date and of the
+    requested model, else reconstructed; without what was deleted from it, and what lies outside of
+    the region ``roi``, as `resolve_region` reads it.
     """
     store, stored = job.store, f"clouds/{name}"
     region = resolve_region(store, roi)
-    meta = store.load_result(stored, only=())[0] if is_up_to_date(store, stored) else {}
-    if meta and model in (None, "", meta["model"]):
+    capture, fresh = store.load_capture(name), is_up_to_date(store, stored)
+    if capture.is_imported_cloud and not fresh:
+        raise InputError(f"the points of {name} are missing: import its file again with --force")
+    meta = store.load_result(stored, only=())[0] if fresh else {}
+    if meta and (capture.is_imported_cloud or model in (None, "", meta["model"])):
         names = set(meta["arrays"]) - {"phase", "modulation"}
         arrays = store.load_result(stored, only=names)[1]
-        for message in lens_warnings(store, store.load_capture(name)):
+        for message in lens_warnings(store, capture):
             job.warn(message)
         misfit = Misfit.pop_from(arrays)
         cloud = Cloud(axis=meta["axis"], model=meta["model"], misfit=misfit, **arrays)

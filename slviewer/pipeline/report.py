@@ -324,6 +324,10 @@ def _describe_calibration(store: Session, name: str) -> list[str]:
 def summarise_capture(capture: Capture) -> str:
     """A capture in one line: sizes, axes, frames, and the finest pattern of each axis."""
     sequence, (width, height) = capture.sequence, capture.size
+    if capture.is_imported_cloud:
+        return (
+            f"{capture.name:<16} {capture.role:<12} imported cloud, from {capture.meta['source']}"
+        )
     patterns = ", ".join(
         f"{axis} {'period' if sequence.periods_px(axis) else 'Gray cell'}"
         f" {sequence.period_px(axis):g} px"

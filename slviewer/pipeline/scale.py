@@ -22,7 +22,7 @@ def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
     is none, or it is of another calibration. Its standard uncertainty is half of ``U_ppm``; without
     a correction the scale is the target's."""
     name, calibration = f"scale/{model}", f"calibration/{model}"
-    if not (store.has_result(name) and store.has_result(calibration)):
+    if not (model and store.has_result(name) and store.has_result(calibration)):
         return None
     meta = store.load_result(name, only=())[0]
     return meta if meta["inputs"] == store.input_hashes(calibration) else None
@@ -44,12 +44,13 @@ def describe_scale(store: Session, model: str) -> str:
 
 
 def describe_calibration(store: Session, model: str, captures: Iterable[str]) -> dict[str, Any]:
-    """Return what a record of clouds of captures states of their calibration, and its inputs."""
-    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
+    """Return what a record of clouds of captures states of their calibration, none ("") of imported
+    ones, and its inputs."""
+    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}")) if model else ()
     return {
         "model": model,
         "scale": describe_scale(store, model),
-        "scales": {model: scale_factor(store, model)},
+        "scales": {model: scale_factor(store, model)} if model else {},
         "inputs": store.input_hashes(*captures, *calibrations),
     }
 

@@ -43,7 +43,7 @@ class Misfit:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """The organised cloud of one capture.
+    """The organised cloud of one capture, or points that were imported.
 
     ``points``: (h, w, 3) float32 mm in the camera's frame, NaN where invalid. ``axis``: the one
     that depth came from. ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm,
@@ -52,7 +52,9 @@ class Cloud:
     does not know. ``sigma_edges``: (h, w) float32 mm, what the camera's blur at edges and a
     ``misfit`` of the axes add, systematic as well; None where nothing does. ``texture``: (h, w)
     grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's
-    range (10, 12, 14 or 16 bits, whichever holds its brightest pixel).
+    range (10, 12, 14 or 16 bits, whichever holds its brightest pixel). ``normals``: (h, w, 3)
+    float32 of imported points, which lie in rows without being neighbours, in the frame of their
+    file; their ``model`` is "", and ``sigma_z`` along these normals.
     """
 
     points: Points
@@ -63,9 +65,10 @@ class Cloud:
     sigma_calibration: Map | None = None
     sigma_edges: Map | None = None
     misfit: Misfit | None = None
+    normals: Points | None = None
 
     def __post_init__(self) -> None:
-        for name in ("points", "sigma_z", "sigma_calibration", "sigma_edges"):
+        for name in ("points", "sigma_z", "sigma_calibration", "sigma_edges", "normals"):
             if (values := getattr(self, name)) is not None:
                 vars(self)[name] = np.asarray(values, dtype=np.float32)
         points, shape = self.points, self.sigma_z.shape

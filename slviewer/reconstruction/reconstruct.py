@@ -109,6 +109,11 @@ def normals(points: Points, reach: int = 2) -> Points:
     return out
 
 
+def cloud_normals(cloud: Cloud) -> Points:
+    """Return the unit normals (h, w, 3) of a cloud: its own, or those of its grid."""
+    return normals(cloud.points) if cloud.normals is None else cloud.normals
+
+
 def _measure(model: Model, phase: PhaseMap) -> Measured:
     """Points (h, w, 3) mm, NaN where the camera's blur spoils the phase at an edge; the standard
     deviation (h, w) mm of their depth, from the phase noise and from what the calibration's own

@@ -3,12 +3,26 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import msgspec
+
 from slviewer.records.record import Count, Record
 from slviewer.records.table import Column, Table
 
 REPORTED_RAISE = 1.2
 """Times its predicted noise that a calibration's residual is, from which raising sigma is
 reported."""
+
+
+class ImportedPoints(msgspec.Struct, frozen=True):
+    """Where an imported cloud is from: name, hash and unit of its file, what the normals and the
+    standard deviation of its points rest on, in words, and notes on what was dropped or added."""
+
+    file: str
+    hash: str
+    unit: str
+    normals: str
+    sigma: str
+    notes: tuple[str, ...] = ()
 
 
 class Reconstruction(Record, frozen=True, kw_only=True):
@@ -24,6 +38,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     miss each other beyond what is predicted, None where they do not; ``masked``: share of the
     pixels, 0 to 1, outside the calibrated region, None for models that mask none; ``scale``: the
     correction of scale, in words; ``frame``: the one that the points are in, in words.
+    ``imported``: of points from a file, in rows that mean nothing; their arrays are ``points``,
+    ``normals`` (h, w, 3), ``sigma_z`` along these, and ``texture`` where they have colours.
     """
 
     kind: ClassVar[str] = "clouds"
@@ -39,6 +55,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     masked: float | None = None
     scale: str = ""
     frame: str = ""
+    imported: ImportedPoints | None = None
 
     @classmethod
     def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -65,7 +82,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
         rows = [
             {
                 "capture": name,
-                "model": each.model,
+                "model": each.model or "imported",
                 Column("axis", align="centre", detail=True): each.axis,
                 "points": each.points,
                 Column("nearest", "mm", digits=0): each.depth_mm and each.depth_mm[0],
@@ -98,5 +115,10 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             " the standard deviations of depth, by the capture's noise and by what the calibration"
             " leaves uncertain."
         )
-        notes = [note, *raised, *(f"Frame: {frame}." for frame in frames)]
+        imported = [
+            f"{name}: {'; '.join((f'from {i.file} in {i.unit}', i.normals, i.sigma, *i.notes))}."
+            for name, each in found.items()
+            if (i := each.imported) is not None
+        ]
+        notes = [note, *raised, *imported, *(f"Frame: {frame}." for frame in frames)]
         return [Table.of(rows, cls.title, notes).without_empty()]

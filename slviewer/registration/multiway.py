@@ -305,6 +305,11 @@ class _PoseGraphBuilder:
         where these are too few, so that it would fail later."""
         if isinstance(cloud, PreparedScan):
             return cloud
+        sigma = cloud.sigma_z[cloud.mask & np.isfinite(cloud.sigma_z)]
+        sigma_mm = float(np.median(sigma)) if sigma.size else None
+        if cloud.normals is not None:
+            facing = choose_pixels(cloud.normals, cloud.mask)
+            return prepare_scan(name, cloud.measured, facing, sigma_mm, has_camera=False)
         measured = np.count_nonzero(cloud.mask)
         trusted = away_from_edges(cloud.points, cloud.sigma_z)
         points = choose_pixels(cloud.points, trusted)
@@ -314,13 +319,8 @@ class _PoseGraphBuilder:
                 " or depth steps: the cloud is too sparse or too noisy to be aligned; capture it"
                 " with more light and longer exposure, or with more phase steps"
             )
-        sigma = cloud.sigma_z[cloud.mask & np.isfinite(cloud.sigma_z)]
-        prepared = prepare_scan(
-            name,
-            points,
-            choose_pixels(grid_normals(cloud.points), trusted),
-            float(np.median(sigma)) if sigma.size else None,
-        )
+        facing = choose_pixels(grid_normals(cloud.points), trusted)
+        prepared = prepare_scan(name, points, facing, sigma_mm)
         self._report(self._share + 0.2 / len(self.names))
         return prepared
 

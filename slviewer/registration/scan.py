@@ -127,12 +127,17 @@ class PreparedScan:
 
 
 def prepare_scan(
-    name: str, points: np.ndarray, normals: np.ndarray | None = None, sigma_mm: float | None = None
+    name: str,
+    points: np.ndarray,
+    normals: np.ndarray | None = None,
+    sigma_mm: float | None = None,
+    has_camera: bool = True,
 ) -> PreparedScan:
     """Prepare the points ``(n, 3)`` mm of one scan, in the frame of its camera, for registration.
 
-    ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for
-    errors. Raises ``InputError`` for points that cannot be used.
+    ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; unless it
+    ``has_camera``, the points were seen from anywhere. ``name`` is for errors. Raises
+    ``InputError`` for points that cannot be used.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
@@ -156,7 +161,7 @@ def prepare_scan(
             f"Nearly all points of the {name} are one: give those that were measured, each once."
         )
     voxel = FINEST_MM * scale_of(size)
-    fine = _make_cloud(points, normals, voxel)
+    fine = _make_cloud(points, normals, voxel, has_camera)
     if len(fine.points) < LEAST_POINTS // 5:
         raise InputError(
             f"Nearly all of the {len(points)} points of the {name} are seen at grazing angles or"
@@ -180,9 +185,9 @@ def measure_size(points: np.ndarray) -> float:
     return float((high - low).max())
 
 
-def _make_cloud(points: Floats, normals: np.ndarray | None, voxel: float) -> Any:
+def _make_cloud(points: Floats, normals: np.ndarray | None, voxel: float, has_camera: bool) -> Any:
     """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the
-    origin."""
+    origin, if it has one."""
     # a NaN normal weighs nothing in a voxel's mean
     finite = None if normals is None else np.nan_to_num(np.asarray(normals, dtype=np.float64))
     cloud = point_cloud(points, finite).voxel_down_sample(voxel)
@@ -193,6 +198,8 @@ def _make_cloud(points: Floats, normals: np.ndarray | None, voxel: float) -> Any
         known = lengths(np.asarray(cloud.normals)) > 0.1
         cloud = cloud.select_by_index(np.flatnonzero(known))
         cloud.normalize_normals()
+    if not has_camera:
+        return cloud
     seen = np.asarray(cloud.points)
     facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / lengths(seen)
     return cloud.select_by_index(np.flatnonzero(facing > _GRAZING))

@@ -106,11 +106,15 @@ def register_object(
     A background that fills more of the image than the object would keep the scans where they are.
     So where parts of the scans agree without motion, the other parts are registered first; each
     point is then assigned to the motion that it agrees with, and the object's points alone are
-    registered again. Raises as ``register_all`` does.
+    registered again. Beside imported clouds nothing is removed. Raises as ``register_all`` does.
 
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
     """
     starts = starts or Starts()
+    if any(cloud.normals is not None for cloud in clouds.values()):  # no camera, no free space
+        alignment = register_all(clouds, reference, starts, progress)
+        none = {name: np.zeros_like(cloud.mask) for name, cloud in clouds.items()}
+        return ObjectAlignment(alignment, clouds, none, {})
     all_samples = _sample_clouds(clouds)
     alignment, static = _register_once(clouds, all_samples, reference, starts, progress)
     first_start = {pair: registration.start for pair, registration in alignment.pairs.items()}

@@ -228,11 +228,17 @@ def _captures_section(data: SessionData) -> Section:
                 "capture": capture.name,
                 "role": capture.role,
                 "state": Cell(each.state, marks.get(each.state, "")),
-                Column("camera", "px", align="right"): "{}x{}".format(*capture.size),
-                Column("projector", "px", align="right"): (
-                    "{}x{}".format(*size) if size else "unknown"
+                Column("camera", "px", align="right"): (
+                    "" if capture.is_imported_cloud else "{}x{}".format(*capture.size)
                 ),
-                "frames": len(sequence.frames),
+                Column("projector", "px", align="right"): (
+                    "{}x{}".format(*size)
+                    if size
+                    else ""
+                    if capture.is_imported_cloud
+                    else "unknown"
+                ),
+                "frames": len(sequence.frames) or "",
                 Column("period", "px", align="centre"): ", ".join(periods),
                 "made": capture.meta.get("created", ""),
                 "why not used": each.why,

@@ -73,6 +73,19 @@ class Capture:
     meta: dict[str, Any] = field(repr=False, compare=False)
 
     @property
+    def is_imported_cloud(self) -> bool:
+        """Whether it is a cloud from a file, which has no frames, and no calibration."""
+        return not self.sequence.frames
+
+    def require_frames(self, verb: str) -> None:
+        """Raise InputError, that this cannot be done, for an imported cloud."""
+        if self.is_imported_cloud:
+            raise InputError(
+                f"Cannot {verb} {self.name!r}: it was imported as a cloud ({self.meta['source']})"
+                " and has no frames. Align, merge, measure or compare it as it is."
+            )
+
+    @property
     def frames(self) -> np.ndarray:
         """All frames (n, h, w), uint8 or uint16, in the sequence's order; read anew at every
         access."""
@@ -85,8 +98,9 @@ class Capture:
         Those of a capture in several exposures are merged, pixel by pixel, by `exposure_choice`.
         Raises DamagedError where a frame is not what was saved (of an older capture, whose frames
         have no checksums, only where all are read), SessionError where the capture was replaced
-        since it was loaded.
+        since it was loaded, InputError for an imported cloud.
         """
+        self.require_frames("decode")
         stored = FrameStack.open(self.folder / "frames.zarr")
         n, (width, height) = len(self.sequence.frames) * max(1, len(self.exposures_ms)), self.size
         if (shape := stored.shape) != (n, height, width):
@@ -104,6 +118,8 @@ class Capture:
     def verify(self) -> list[str]:
         """Read everything; returns the hash of each stored frame. Raises DamagedError unless the
         frames and their description are those that were saved."""
+        if self.is_imported_cloud:
+            return []  # its points are those of the result that states its hash
         content, frames = FrameStack.open(self.folder / "frames.zarr").hash()
         described, exposures_ms = self.meta["sequence"], self.meta.get("exposures_ms")
         if _hash_content(content, described, exposures_ms, self.texture) != self.hash:
@@ -205,7 +221,8 @@ class NewCapture:
     """A capture in memory, to be saved: ``frames`` (n, h, w) uint8 or uint16 in the order of
     ``sequence``, or (k n, h, w) of the k ``exposures_ms``, one exposure after the other;
     ``texture`` (h, w, 3) RGB where the scene is known in colour; ``source``: where it comes from;
-    ``files``: of an import, relative to that, one a frame.
+    ``files``: of an import, relative to that, one a frame. An imported cloud has no frames, (0, h,
+    w) of its rows of points, and their hash as ``settings["cloud"]``.
     """
 
     name: str
@@ -222,7 +239,8 @@ class NewCapture:
         """The content hash that the capture will have once it is saved: of frames, exposures,
         texture, sequence."""
         described, exposures_ms = self.sequence.to_dict(), list(self.exposures_ms)
-        return _hash_content(hash_frames(self.frames), described, exposures_ms, self.texture)
+        frames = hash_frames(self.frames) if len(self.frames) else self.settings["cloud"]
+        return _hash_content(frames, described, exposures_ms, self.texture)
 
     @property
     def nbytes(self) -> int:
@@ -242,6 +260,8 @@ class NewCapture:
         """Raise InputError unless frames, exposures and texture fit the sequence and one
         another."""
         exposures, texture, shape = self.exposures_ms, self.texture, self.frames.shape
+        if not self.sequence.frames:
+            return
         check_stack_array(self.frames)
         if (
             len(exposures) == 1
@@ -269,7 +289,9 @@ class NewCapture:
 def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | None) -> None:
     """Write a checked capture into an empty folder, every file synced."""
     frames, texture, exposures_ms = capture.frames, capture.texture, list(capture.exposures_ms)
-    frames_hash = write_stack(folder / "frames.zarr", frames)
+    frames_hash = (
+        write_stack(folder / "frames.zarr", frames) if len(frames) else capture.settings["cloud"]
+    )
     described = capture.sequence.to_dict()
     if texture is not None:
         import cv2
@@ -316,8 +338,10 @@ def _read_capture(folder: Path, identity: object) -> Capture:
     meta = read_json(folder / "capture.json")
     with decoding(folder / "capture.json"):
         described = from_plain(meta, _Description)
-        sequence = PatternSequence.from_dict(described.sequence)
         from_plain(described.settings.get("lens", {}), dict[str, float])
+        sequence = PatternSequence(None, ())
+        if "cloud" not in described.settings:
+            sequence = PatternSequence.from_dict(described.sequence)
         if "turntable" in described.settings:
             from_plain(described.settings["turntable"], TurnStep)
     return Capture(

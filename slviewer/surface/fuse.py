@@ -7,7 +7,7 @@ scan's surface is interpolated between pixels, with a lower weight where it is c
 nothing is smoothed beyond one scan's resolution.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Any
@@ -22,6 +22,7 @@ from slviewer.geometry.vectors import lengths, rms, unit_vectors
 from slviewer.reconstruction.cloud import Cloud, Points, choose_pixels, keep_pixels
 from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes, measure_heights
 from slviewer.surface.shapes import PointSet
+from slviewer.surface.unorganised import fuse_points, point_set
 from slviewer.surface.view import View, prepare_view, viewing_cosines
 
 Progress = Callable[[float], None]
@@ -85,8 +86,8 @@ def fuse(
     progress: Progress | None = None,
     poses: Mapping[str, Uncertainty] | None = None,
 ) -> Fused:
-    """Fuse organised clouds, each in its camera's frame, with the pose (4, 4) of each by the same
-    name.
+    """Fuse clouds, organised ones each in its camera's frame, with the pose (4, 4) of each by the
+    same name.
 
     ``poses``: how uncertain these poses are, in the reference's frame; it becomes part of the
     points' sigmas, as if a point were from its best scan alone.
@@ -101,6 +102,8 @@ def fuse(
         if name not in T_reference_scan:
             raise InputError(f"{name} has no pose: register it first, or exclude it.")
     report, views = progress or (lambda share: None), {}
+    if any(cloud.normals is not None for cloud in scans.values()):
+        return _fuse_unorganised(scans, T_reference_scan, poses)
     for i, (name, cloud) in enumerate(scans.items()):
         report(0.3 * i / len(scans))
         views[name] = prepare_view(name, cloud, T_reference_scan[name])
@@ -118,10 +121,42 @@ def fuse(
     for i, name in enumerate(names):
         report(0.5 + 0.5 * i / len(names))
         points, seen_by = _fuse_scan(name, views, pairs, gains)
-        if poses is not None and name in poses:
-            points = _add_pose_error(points, poses[name])
         parts.append((points, seen_by))
     report(1.0)
+    return _join_parts(names, parts, poses, excluded, pairs)
+
+
+def _fuse_unorganised(
+    scans: Mapping[str, Cloud],
+    T_reference_scan: Mapping[str, np.ndarray],
+    poses: Mapping[str, Uncertainty] | None,
+) -> Fused:
+    """Fuse clouds of which some were imported, as `fuse_points` does; the others are cleaned."""
+    sets = {
+        name: fuse({name: cloud}, T_reference_scan).surface
+        if cloud.normals is None
+        else point_set(cloud, T_reference_scan[name])
+        for name, cloud in scans.items()
+    }
+    if any(each.colours is None for each in sets.values()):
+        sets = {name: replace(each, colours=None) for name, each in sets.items()}
+    return _join_parts(tuple(sets), fuse_points(sets), poses, {name: {} for name in sets}, {})
+
+
+def _join_parts(
+    names: tuple[str, ...],
+    parts: Sequence[tuple[PointSet, np.ndarray]],
+    poses: Mapping[str, Uncertainty] | None,
+    excluded: dict[str, dict[str, int]],
+    pairs: dict[tuple[str, str], SurfaceAgreement],
+) -> Fused:
+    """Return the points of each scan that remain, and the numbers of scans in them, as one
+    surface."""
+    if poses is not None:
+        parts = [
+            (_add_pose_error(points, poses[name]) if name in poses else points, seen_by)
+            for name, (points, seen_by) in zip(names, parts, strict=True)
+        ]
     # either all scans have colours, or none
     surface: dict[str, Any] = {
         name: None if value is None else np.concatenate([vars(part)[name] for part, _ in parts])

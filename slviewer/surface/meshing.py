@@ -3,7 +3,7 @@ what it did."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -172,9 +172,7 @@ def build_mesh(
     no surface, or none that can be closed as asked.
     """
     plan, report = plan or MeshingPlan(), progress or (lambda share, step: None)
-    method = plan.method or (
-        "grid" if isinstance(shape, Cloud) and not plan.watertight else "poisson"
-    )
+    method = plan.method or ("grid" if _has_grid(shape) and not plan.watertight else "poisson")
     report(0.0, "finding the surface")
     points = (
         shape if isinstance(shape, PointSet) else fuse({"scan": shape}, {"scan": np.eye(4)}).surface
@@ -219,6 +217,11 @@ def build_mesh(
     return BuiltMesh(mesh, method, cell, dropped, trimmed, filled, smoothed, thinned, topology)
 
 
+def _has_grid(shape: Cloud | PointSet) -> TypeGuard[Cloud]:
+    """Return whether pixels of a shape are neighbours on the surface."""
+    return isinstance(shape, Cloud) and shape.normals is None
+
+
 def measure_spacing(points: PointSet) -> float:
     """Median distance in mm of a point to its nearest neighbour."""
     if len(points) < 2:
@@ -253,10 +256,10 @@ def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
     Vertices carry the pixels' normals, colours and sigmas (along the normal). Raises InputError for
     merged points, and where no two neighbouring pixels lie on a surface.
     """
-    if not isinstance(cloud, Cloud):
+    if not _has_grid(cloud):
         raise InputError(
-            "Merged points have no pixels: the method grid takes a single scan; use poisson or"
-            " volume."
+            "Merged or imported points have no pixels: the method grid takes a single scan; use"
+            " poisson or volume."
         )
     normals = grid_normals(cloud.points)
     cleaned, _ = clean(cloud, normals)

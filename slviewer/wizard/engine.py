@@ -241,7 +241,7 @@ class Engine:
         for capture in reader.session.captures():
             key = (capture.name, capture.hash, target)
             with self._lock:
-                if key in self._queued:
+                if key in self._queued or capture.is_imported_cloud:
                     continue
                 self._queued.add(key)
             self._jobs.submit(

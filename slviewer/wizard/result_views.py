@@ -103,7 +103,10 @@ def whole_cloud(session: Session, name: str) -> ScanCloud:
     verified = f"verify/{name}"
     errors = session.load_result(verified)[1] if session.has_result(verified) else {}
     errors = {key.removeprefix("error_"): array for key, array in errors.items()}
-    known: dict[str, Any] = {"errors": errors, "misfit": Misfit.pop_from(arrays), **arrays}
+    shape, misfit = arrays["points"].shape[:2], Misfit.pop_from(arrays)
+    unknown = dict.fromkeys(("phase", "modulation"), np.full(shape, np.nan, np.float32))
+    arrays = unknown | {"texture": np.full(shape, 128, np.uint8)} | arrays  # of an imported cloud
+    known: dict[str, Any] = {"errors": errors, "misfit": misfit, **arrays}
     return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], **known)
 
 
@@ -176,7 +179,7 @@ def _read_surface(folder: Path, name: str, *content: str) -> MeasuredSurface:
     if name.startswith(MERGED):
         return load_merged_surface(store, name)
     cloud = load_scan_cloud(store, name)
-    return surface_from_cloud(store, name, cloud, load_model(store, cloud.model))
+    return surface_from_cloud(store, name, cloud)
 
 
 def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> Place | None:
