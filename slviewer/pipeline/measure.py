@@ -11,6 +11,7 @@ import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError, UsageError
+from slviewer.geometry.rigid import move_points
 from slviewer.inspection.features import KINDS, Feature, distance, relation
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.regions import Region
@@ -22,6 +23,7 @@ from slviewer.pipeline.models import (
     ModelName,
     available_models,
     check_accepted,
+    device_centres,
     load_model,
     preferred_model,
     warn_if_stale,
@@ -73,14 +75,14 @@ Place = tuple[int, int] | int
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSurface:
-    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was
-    measured.
+    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where not measured.
 
     ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along
     ``normals`` for a merged surface; ``left_mm`` likewise: standard deviation from the calibration,
     where known. ``faces`` (m, 3): of a merged mesh. ``source`` is the capture or result that it
     came from, ``model`` the calibration, ``inputs`` the hashes of both; ``shared``: the covariance
-    of errors of that ``calibration``, by its hash, where known.
+    of errors of that ``calibration``, by its hash. ``views``: of each scan the centres (2, 3) mm of
+    camera and projector. Each where known.
     """
 
     points: np.ndarray
@@ -95,6 +97,7 @@ class MeasuredSurface:
     calibration: str = ""
     texture: np.ndarray | None = None
     scale: float = 1.0
+    views: Sequence[np.ndarray] = ()
 
     @property
     def organised(self) -> bool:
@@ -215,16 +218,17 @@ def surface_from_cloud(
         calibration="" if shared is None else inputs[calibration],
         texture=cloud.texture,
         scale=scale,
+        views=device_centres(store),
     )
 
 
 def load_merged_surface(
     store: Session, merge: str, warn: Warn = ignore_warnings, roi: str = ""
 ) -> MeasuredSurface:
-    """A stored merge ``merge/<number>``, in the frame of its reference's camera; ``roi`` as in
-    `read_merge`."""
+    """A stored merge, in the frame of its reference's camera; ``roi`` as in `read_merge`."""
     record, points = read_merge(store, merge, warn, roi)
     sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))
+    poses = [np.eye(4), *(np.array(pair.T_reference_scan) for pair in record.pairs.values())]
     return MeasuredSurface(
         points.points,
         sigma,
@@ -235,6 +239,7 @@ def load_merged_surface(
         faces=points.faces,
         texture=points.colours,
         scale=record.scales.get(record.model, 1.0),
+        views=[move_points(T, view) for view in device_centres(store) for T in poses],
     )
 
 
