@@ -1,6 +1,7 @@
 """Signed deviations of a scan from a nominal model after best-fit alignment: their statistics and
 colours, and whether they stay within a tolerance, as far as their uncertainty lets one say."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,32 +12,44 @@ from slviewer.geometry.rigid import (
     Floats,
     Mask,
     Uncertainty,
-    distance_jacobian,
     move_points,
-    turn_about,
 )
-from slviewer.geometry.vectors import rms, subsample
-from slviewer.inspection.nominal_surface import NominalSurface, search_start
+from slviewer.geometry.vectors import rms, subsample, unit_vectors
+from slviewer.inspection.nominal_surface import REACH, NominalSurface, fit_pose, search_pose
 from slviewer.inspection.uncertainty import scatter_covariance
 from slviewer.records.acceptance import Decision, worst_decision
-from slviewer.records.measurement import ToleranceVerdict
-from slviewer.registration.pairwise import Progress, Registration
+from slviewer.records.measurement import LEAST_AREA, ToleranceVerdict
+from slviewer.registration.pairwise import Progress
 from slviewer.surface.shapes import Mesh
 
-REACH = 0.02
-"""Of the nominal's diagonal: scan points farther from it belong to something else, a table or a
-clamp."""
 NOISE_REACH = 10.0
 COVERAGE_SAMPLES = 20_000
+MIN_SEEN_COSINE = 0.45
+"""Of a place on the nominal that a view can measure: at more oblique ones points are few."""
+MIN_PLACES = 20
 MAX_ALIGNED_POINTS = 60_000
 MAX_FEET = 400_000
 SPACINGS = 3.0
 """A place on the nominal was measured if a scan point's foot is no farther than so many of their
 spacings."""
-MAX_ITERATIONS = 40
-MIN_NORMAL_COSINE = 0.5
-"""Cosine: a scan point whose normal is turned away further from the nominal's lies on something
-else there."""
+
+
+@dataclass(frozen=True, eq=False)
+class NominalArea:
+    """Places (n, 3) mm evenly over the nominal's area, in its frame; which of them were
+    ``measured``, and which the views can see, (n,) bool."""
+
+    places: Floats
+    measured: Mask
+    is_visible: Mask
+
+    def percent_measured(self, within: Mask | None = None) -> float | None:
+        """Percent of the visible area, of the places ``within`` (n,) bool alone, that was measured;
+        None where hardly any is visible."""
+        chosen = self.is_visible if within is None else self.is_visible & within
+        if np.count_nonzero(chosen) < MIN_PLACES:
+            return None
+        return 100 * float(self.measured[chosen].mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,21 +59,32 @@ class Deviation:
     ``signed`` (n,) float32 mm: of each scan point, positive outside the nominal; NaN for points
     farther than ``reach_mm``, or that face another way. ``T_nominal_scan`` (4, 4) is the best fit;
     ``normals`` (n, 3) the nominal's where each point's nearest place is, in the scan's frame, NaN
-    likewise. ``coverage``: share of the nominal's area that was measured; ``uncovered`` (k, 3) mm:
-    places of the rest, in the scan's frame. ``alignment_mm``: standard uncertainty that the best
-    fit adds to a point, RMS over the points; ``alignment_spread`` its covariance, in the nominal's
-    frame.
+    likewise. ``area``: what of the nominal was measured. ``alignment_mm``: standard uncertainty
+    that the best fit adds to a point, RMS over the points; ``alignment_spread`` its covariance, in
+    the nominal's frame. ``surface``: the nominal, of whose triangles ``turned`` faced away from the
+    scan.
     """
 
     signed: np.ndarray
     normals: np.ndarray
     T_nominal_scan: Floats
     reach_mm: float
-    coverage: float
-    uncovered: Floats
+    area: NominalArea
     alignment_mm: float
-    start: Registration | None = None
-    alignment_spread: Uncertainty | None = None
+    alignment_spread: Uncertainty
+    surface: NominalSurface
+    turned: int = 0
+
+    @property
+    def coverage(self) -> float:
+        """Share of the nominal's area that was measured."""
+        return float(self.area.measured.mean())
+
+    @property
+    def uncovered(self) -> Floats:
+        """(k, 3) float32 mm: places on the nominal that were not measured, in the scan's frame."""
+        back = np.asarray(np.linalg.inv(self.T_nominal_scan), np.float64)
+        return move_points(back, self.area.places[~self.area.measured]).astype(np.float32)
 
     @property
     def counted(self) -> Mask:
@@ -104,6 +128,7 @@ def deviation(
     sigma_mm: float | None = None,
     reach_mm: float | None = None,
     initial: Floats | None = None,
+    views: Sequence[Floats] = (),
     progress: Progress | None = None,
     has_camera: bool = True,
 ) -> Deviation:
@@ -113,8 +138,9 @@ def deviation(
     than the nominal is excluded by them. ``sigma_mm``: the expected error of one point.
     ``reach_mm``: points farther off the nominal belong to something else; by default 2 % of its
     diagonal, never below ten times the noise. ``initial`` (4, 4) scan to nominal: replaces the
-    search. ``has_camera``: whether the scan was seen from its origin. Raises SlviewerError where
-    the two cannot be aligned with trust.
+    search. ``views``: of each view the centres (k, 3) mm of its devices, in the scan's frame, which
+    all have to see a place; all places are visible without. ``has_camera``: whether the scan was
+    seen from its origin. Raises SlviewerError where the two cannot be aligned with trust.
     """
     report = progress or (lambda share: None)
     points = np.asarray(points, np.float64)
@@ -128,17 +154,22 @@ def deviation(
     if not reach_mm > 0:
         raise InputError(f"A reach of {reach_mm:g} mm was given: give a positive one.")
     report(0.0)
-    start = None
-    if initial is None:
-        start = search_start(
+    T = initial
+    if T is None:
+        T = search_pose(
             points, normals, surface, sigma_mm, lambda share: report(0.6 * share), has_camera
         )
-        initial = start.T_reference_scan
+    turned = np.zeros(len(nominal.faces), bool)
+    if normals is not None:
+        turned = surface.seen_from_behind(points, normals, T, reach_mm)
+    if turned.any():
+        faces = np.where(turned[:, None], nominal.faces[:, ::-1], nominal.faces)
+        surface = NominalSurface(Mesh(nominal.vertices, faces))
     T, alignment, spread = _refine_best_fit(
-        points, normals, surface, initial, reach_mm, lambda share: report(0.6 + 0.2 * share)
+        points, normals, surface, T, reach_mm, lambda share: report(0.6 + 0.2 * share)
     )
     report(0.8)
-    signed, towards = _signed_distances(points, normals, surface, T, reach_mm)
+    signed, towards = surface.distances(points, normals, T, reach_mm)
     counted = np.isfinite(signed)
     if not counted.any():
         raise InputError(
@@ -147,39 +178,19 @@ def deviation(
         )
     report(0.95)
     feet = move_points(T, points[counted]) - signed[counted, None] * towards[counted]
-    measured, uncovered = _measure_coverage(feet, surface)
-    back = np.linalg.inv(T)
+    area = _measure_area(feet, surface, [move_points(T, centres) for centres in views])
     report(1.0)
     return Deviation(
         signed.astype(np.float32),
         (towards @ T[:3, :3]).astype(np.float32),
         T,
         reach_mm,
-        measured,
-        move_points(back, uncovered).astype(np.float32),
+        area,
         alignment,
-        start,
         spread,
+        surface,
+        int(turned.sum()),
     )
-
-
-def _signed_distances(
-    points: Floats,
-    normals: Floats | None,
-    surface: NominalSurface,
-    T: Floats,
-    reach: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances (n,) and the nominal's normals (n, 3), NaN where a point does not belong to
-    it."""
-    away, towards = surface.signed(move_points(T, points))
-    belongs = np.abs(away) <= reach
-    if normals is not None:
-        cosine = np.sum((normals @ T[:3, :3].T) * towards, axis=1)
-        belongs &= ~(cosine < MIN_NORMAL_COSINE)  # an unknown normal excludes nothing
-    away[~belongs] = np.nan
-    towards[~belongs] = np.nan
-    return away, towards
 
 
 def _refine_best_fit(
@@ -190,54 +201,45 @@ def _refine_best_fit(
     reach: float,
     report: Progress,
 ) -> tuple[np.ndarray, float, Uncertainty]:
-    """The pose of least squared distances of the points that belong to the nominal, by
-    Gauss-Newton, the standard uncertainty, mm, that its own gives the points, and its
-    covariance."""
+    """The pose of least squared distances of the points that belong to the nominal, the standard
+    uncertainty, mm, that its own gives the points, and its covariance."""
     points = subsample(points, MAX_ALIGNED_POINTS)
     normals = None if normals is None else subsample(normals, MAX_ALIGNED_POINTS)
-    T = np.array(T, np.float64)
-    for turn in range(MAX_ITERATIONS):
-        report(turn / MAX_ITERATIONS)
-        away, towards = _signed_distances(points, normals, surface, T, reach)
-        counted = np.isfinite(away)
-        if np.count_nonzero(counted) < 100:
-            raise InputError(
-                f"Only {np.count_nonzero(counted)} points of the scan lie within {reach:.3g} mm of"
-                " the nominal model: does it show that part?"
-            )
-        moved = move_points(T, points[counted])
-        middle = moved.mean(axis=0)
-        J = distance_jacobian(moved - middle, towards[counted])
-        information = J.T @ J
-        change = -np.linalg.lstsq(information, J.T @ away[counted], rcond=1e-10)[0]
-        T = turn_about(change[:3], middle, change[3:]) @ T
-        if np.abs(J @ change).max() < 1e-5:
-            break
-    covariance = scatter_covariance(moved, J, away[counted])
+    T, moved, J, away = fit_pose(points, normals, surface, T, reach, report=report)
+    covariance = scatter_covariance(moved, J, away)
     return (
         T,
         float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean())),
-        Uncertainty(covariance, middle),
+        Uncertainty(covariance, moved.mean(axis=0)),
     )
 
 
-def _measure_coverage(feet: Floats, surface: NominalSurface) -> tuple[float, Floats]:
-    """Share of the nominal's area that was measured, and places (k, 3) in its frame of the rest.
-    ``feet`` (n, 3): where on the nominal the scan's points were measured."""
-    places, _ = surface.sample(COVERAGE_SAMPLES, seed=1)
+def _measure_area(feet: Floats, surface: NominalSurface, views: Sequence[Floats]) -> NominalArea:
+    """What of the nominal was measured. ``feet`` (n, 3): where on it the scan's points were
+    measured; ``views`` as in `deviation`, in its frame."""
+    places, facing = surface.sample(COVERAGE_SAMPLES, seed=1)
     thin = subsample(feet, MAX_FEET)
     tree = cKDTree(thin)
     spacing, _ = tree.query(subsample(thin, 2000), k=2)
     away, _ = tree.query(places, workers=-1)
     measured = away <= SPACINGS * float(np.percentile(spacing[:, 1], 95))
-    return float(measured.mean()), places[~measured]
+    is_visible = np.full(len(places), not views)
+    for centres in views:
+        is_visible |= np.all(
+            [
+                surface.seen_from(places, facing, unit_vectors(centre - places), MIN_SEEN_COSINE)
+                for centre in centres
+            ],
+            axis=0,
+        )
+    return NominalArea(places, measured, is_visible)
 
 
 def judge_deviation(
-    deviation: Deviation, sigma_mm: Floats, tolerance_mm: float
+    deviation: Deviation, sigma_mm: Floats, tolerance_mm: float, least_area: float = LEAST_AREA
 ) -> ToleranceVerdict:
     """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the
-    surface's normal."""
+    surface's normal; ``least_area``: percent of the visible area that it needs."""
     if not tolerance_mm > 0:
         raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
     counted = deviation.counted
@@ -251,16 +253,19 @@ def judge_deviation(
         (end, judge_limits(end, typical, -tolerance_mm, tolerance_mm))
         for end in (numbers["p_low"], numbers["p_high"])
     )
+    area = deviation.area.percent_measured() or 0.0
     return ToleranceVerdict(
         tolerance_mm,
         typical,
         low,
         high,
-        worst_decision({low[1], high[1]}),
+        "undecided" if area < least_area else worst_decision({low[1], high[1]}),
         100 * float(np.mean(off <= tolerance_mm)),
         100 * float(inside.mean()),
         100 * float(outside.mean()),
         100 * float(np.mean(~inside & ~outside)),
+        area,
+        least_area,
     )
 
 

@@ -1,26 +1,39 @@
 """A nominal model: signed distances of points from it, and initial alignment of a scan to it."""
 
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from slviewer.errors import InputError, SlviewerError
-from slviewer.geometry.rigid import Floats, Mask
-from slviewer.geometry.vectors import box_middle, diagonal, lengths, subsample, unit_vectors
-from slviewer.registration.open3d_loader import open3d, raycasting_scene
-from slviewer.registration.pairwise import (
-    MOST_ATTEMPTS,
-    Progress,
-    Registration,
-    register_prepared,
-    search_starts,
+from slviewer.errors import InputError
+from slviewer.geometry.rigid import (
+    Floats,
+    Mask,
+    distance_jacobian,
+    move_points,
+    rigid_transform,
+    turn_about,
 )
+from slviewer.geometry.robust import tukey_weights
+from slviewer.geometry.vectors import (
+    box_middle,
+    diagonal,
+    lengths,
+    rms,
+    rms_length,
+    subsample,
+    unit_vectors,
+)
+from slviewer.registration.open3d_loader import open3d, raycasting_scene
+from slviewer.registration.pairwise import LEAST_AGREEMENT, LEAST_OVERLAP, MOST_SLACK, Progress
+from slviewer.registration.refine import WORDS, Freedom, Shape, freedom_of
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import PreparedScan, prepare_scan
-from slviewer.surface.shapes import Mesh, count_edges
+from slviewer.registration.start import search_starts
+from slviewer.surface.shapes import Mesh, count_edges, label_connected
 
 RIM = 0.5
 """Cosine: what the rim of an open surface faces less than this lies beyond it, not above it."""
@@ -28,6 +41,11 @@ CORNER = 1e-4
 """Barycentric: nearer to a side than this, the nearest place lies on it."""
 NEGLIGIBLE = 1e-4
 """mm: directions from nearer than this to the surface are rounding."""
+MIN_NORMAL_COSINE = 0.5
+"""Cosine: a scan point whose normal is turned away further from the nominal's lies on something
+else there."""
+LEAST_VOTES = 20
+"""Points more that show a patch from behind, from which on it faces the wrong way."""
 
 
 class NominalSurface:
@@ -84,17 +102,60 @@ class NominalSurface:
         normals = np.where(is_clear[:, None], towards, normals)
         return away, normals
 
+    def distances(
+        self,
+        points: Floats,
+        normals: Floats | None,
+        T: Floats,
+        reach: float,
+        *,
+        either_side: bool = False,
+    ) -> tuple[Floats, Floats]:
+        """Signed distances (n,) mm of a scan's points (n, 3) at ``T`` (4, 4), and the surface's
+        normals (n, 3); NaN for points farther than ``reach`` mm, or whose ``normals`` (n, 3) face
+        another way than the surface, or than ``either_side`` of it."""
+        away, towards = self.signed(move_points(T, points))
+        belongs = np.abs(away) <= reach
+        if normals is not None:
+            cosine = np.sum((normals @ T[:3, :3].T) * towards, axis=1)
+            # an unknown normal excludes nothing
+            belongs &= ~((np.abs(cosine) if either_side else cosine) < MIN_NORMAL_COSINE)
+        away[~belongs] = np.nan
+        towards[~belongs] = np.nan
+        return away, towards
+
     def seen_from(self, places: Floats, facing: Floats, view: Floats, least: float) -> Mask:
-        """Return which places (n, 3) on the surface, facing (n, 3), are visible from far away in
-        the direction ``view`` (3,); ``least``: cosine between the two. Returns (n,) bool."""
-        is_visible = facing @ view > least
+        """Return which places (n, 3) on the surface, facing (n, 3), are visible in the unit
+        direction ``view``, (3,) or (n, 3); ``least``: cosine between the two. Returns (n,) bool."""
+        view = np.broadcast_to(view, places.shape)
+        is_visible = np.asarray(np.sum(facing * view, axis=1) > least)
         lift = 1e-4 * self.diagonal
-        origins = (places[is_visible] - self.middle + lift * facing[is_visible]).astype(np.float32)
-        rays = np.concatenate([origins, np.broadcast_to(view, origins.shape)], axis=1).astype(
-            np.float32
-        )
+        origins = (places - self.middle + lift * facing)[is_visible]
+        rays = np.concatenate([origins, view[is_visible]], axis=1).astype(np.float32)
         is_visible[is_visible] = ~self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy()
         return is_visible
+
+    def seen_from_behind(self, points: Floats, normals: Floats, T: Floats, reach: float) -> Mask:
+        """Return which triangles (m,) bool face away from a scan's points (n, 3), with normals
+        (n, 3), at ``T`` (4, 4): of patches that are wound alike, those that most of the points
+        within ``reach`` mm show from behind."""
+        half, _, edge, count = count_edges(self._faces)
+        face = np.tile(np.arange(len(self._faces)), 3)
+        order = np.argsort(edge, kind="stable")
+        one, other = order[:-1], order[1:]
+        # neighbours that are wound alike run along their common edge in opposite directions
+        alike = (
+            (edge[one] == edge[other]) & (count[edge[one]] == 2) & (half[one] != half[other])[:, 0]
+        )
+        pairs = np.stack([face[one[alike]], face[other[alike]]], axis=1)
+        patch = label_connected(pairs, len(self._faces))
+        moved = (move_points(T, points) - self.middle).astype(np.float32)
+        nearest = self._scene.compute_closest_points(open3d().core.Tensor(moved))
+        near = lengths(moved - nearest["points"].numpy()) <= reach
+        hit = nearest["primitive_ids"].numpy().astype(np.int64)[near]
+        cosine = np.sum((normals[near] @ T[:3, :3].T) * self._flat[hit], axis=1)
+        votes = (cosine > MIN_NORMAL_COSINE).astype(float) - (cosine < -MIN_NORMAL_COSINE)
+        return np.asarray(np.bincount(patch[hit], votes, patch.max() + 1)[patch] < -LEAST_VOTES)
 
     def sample(self, count: int, seed: int = 0) -> tuple[Floats, Floats]:
         """Places (count, 3) mm evenly over the area, and the unit normals (count, 3) there."""
@@ -106,15 +167,22 @@ class NominalSurface:
 
 SAMPLES = 60_000
 """Points of the nominal that a scan is aligned with, all around it."""
-MAX_POINTS = 40_000
+MAX_POINTS, FITTED_POINTS = 40_000, 3_000
+"""Points of a scan in the coarse search, and in the fits from there."""
 MIN_VISIBLE = 2_000
-GOOD_RMS = 0.002
-"""Of the nominal's diagonal: no better place is looked for than one that leaves less, or thrice the
-noise, of most of the scan."""
-GOOD_OVERLAP = 0.6
+MIN_COUNTED = 100
+REACH = 0.02
+"""Of the nominal's diagonal: scan points farther from it belong to something else, a table or a
+clamp."""
+GOOD_ERROR = 0.002
+"""Of the nominal's diagonal, or thrice the noise: points fit well that deviate less."""
+GOOD_OVERLAP, GOOD_AGREEMENT, NEAR = 0.6, 0.95, 5.0
+"""Shares of the scan, and of its points within so many reaches of the nominal, that fit well: no
+better pose is searched for."""
 LEAST_SCORE = 0.1
 """Share of the scan that must lie on the nominal after the coarse search: from there on a pose is
-refined. The part itself reaches 0.5 and more, other parts below 0.15."""
+fitted. The part itself reaches 0.5 and more, other parts below 0.15."""
+MAX_ITERATIONS, FEW_ITERATIONS = 40, 10
 VIEWS = [
     unit_vectors(np.array(view))
     for view in sorted(
@@ -128,87 +196,208 @@ AWAY = 3.0
 """Diagonals: from so far."""
 
 
-def search_start(
+@dataclass(frozen=True, eq=False)
+class NominalPose:
+    """A scan's pose ``T`` (4, 4) mm, T_nominal_scan, on a nominal model.
+
+    ``cost``: mean of the points' squared distances over that of the reach, each at most 1, and up
+    to twice as large where they show the surface from behind. ``overlap``: share of the scan on the
+    nominal; ``agreement``: share of these among the points that face it nearby. ``is_good``: nearly
+    all points fit well. ``gate_mm``: distance of the points on it.
+    """
+
+    T: Floats
+    cost: float
+    overlap: float
+    agreement: float
+    is_good: bool
+    gate_mm: float
+
+
+def fit_pose(
+    points: Floats,
+    normals: Floats | None,
+    surface: NominalSurface,
+    T: np.ndarray,
+    reach: float,
+    robust: bool = False,
+    report: Progress = lambda share: None,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Fit the pose of least squared distances of the points that belong to the nominal, by
+    Gauss-Newton; ``robust``: by fewer iterations, with Tukey's weights, on either side of it.
+
+    Returns T (4, 4), and of the points in the last iteration their places (k, 3), the Jacobian
+    (k, 6) about the mean of these, and distances (k,) mm. Raises InputError for too few.
+    """
+    T, iterations = np.array(T, np.float64), FEW_ITERATIONS if robust else MAX_ITERATIONS
+    for turn in range(iterations):
+        report(turn / iterations)
+        away, towards = surface.distances(points, normals, T, reach, either_side=robust)
+        counted = np.isfinite(away)
+        if np.count_nonzero(counted) < MIN_COUNTED:
+            raise InputError(
+                f"Only {np.count_nonzero(counted)} points of the scan lie within {reach:.3g} mm of"
+                " the nominal model: does it show that part?"
+            )
+        moved, away = move_points(T, points[counted]), away[counted]
+        middle = moved.mean(axis=0)
+        J = distance_jacobian(moved - middle, towards[counted])
+        weighted = J * tukey_weights(away, reach / 4.685)[:, None] if robust else J
+        change = -np.linalg.lstsq(weighted.T @ J, weighted.T @ away, rcond=1e-10)[0].astype(float)
+        T = turn_about(change[:3], middle, change[3:]) @ T
+        if np.abs(J @ change).max() < (1e-3 if robust else 1e-5):
+            break
+    return T, moved, J, away
+
+
+def search_pose(
     points: Floats,
     normals: Floats | None,
     surface: NominalSurface,
     sigma_mm: float | None,
     report: Progress,
     has_camera: bool = True,
-) -> Registration:
-    """The scan (n, 3) registered to the nominal.
+) -> Floats:
+    """The pose (4, 4), T_nominal_scan, of a scan's points (n, 3) mm; the nominal's triangles may
+    face either way.
 
-    A scan that ``has_camera`` shows one side of a part: the nominal is tried as a camera sees it
-    from each of `VIEWS`, until one fits well; else the best that is accepted. Raises the first
-    refusal where none is.
+    A scan that ``has_camera`` shows one side of a part: poses are searched on what a camera sees of
+    the nominal from each of `VIEWS` (on all of it first without), and fitted to all of it, until
+    one fits well; else the one of least cost is taken. Among the poses of a symmetric part the
+    choice does not change the deviations. Raises ``Refused`` where the best does not fit, or the
+    shape does not hold it.
     """
-    places, facing = surface.sample(SAMPLES)
-    if normals is not None:
-        normals = subsample(normals, MAX_POINTS)
-    scan = prepare_scan("scan", subsample(points, MAX_POINTS), normals, sigma_mm, has_camera)
-    if not has_camera:
-        whole = prepare_scan("nominal model", places, facing, has_camera=False)
-        with suppress(SlviewerError):  # it may show one side all the same
-            return _register_symmetric(scan, whole)
-    good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
-    refusal: SlviewerError | None = None
-    best: Registration | None = None
-    for turn, view in enumerate(VIEWS):
-        report(turn / len(VIEWS))
-        visible = surface.seen_from(places, facing, view, MIN_FACING_COSINE)
-        if np.count_nonzero(visible) < MIN_VISIBLE:
-            continue
-        camera = surface.middle + AWAY * surface.diagonal * view
-        try:
-            result = _register_symmetric(
-                scan, prepare_scan("nominal model", places[visible] - camera, facing[visible])
-            )
-        except SlviewerError as error:
-            refusal = refusal or error
-            continue
-        T = result.T_reference_scan.copy()
-        T[:3, 3] += camera
-        result = replace(result, T_reference_scan=T)
-        if best is None or result.rms_mm / result.overlap < best.rms_mm / best.overlap:
-            best = result
-        if best.rms_mm <= good and best.overlap >= GOOD_OVERLAP:
+    points = subsample(points, MAX_POINTS)
+    normals = None if normals is None else subsample(normals, MAX_POINTS)
+    scan = prepare_scan("scan", points, normals, sigma_mm, has_camera)
+    few = subsample(points, FITTED_POINTS)
+    few_normals = None if normals is None else subsample(normals, FITTED_POINTS)
+    best: NominalPose | None = None
+    score = 0.0
+    for side, camera in _list_sides(surface, has_camera, report):
+        starts = search_starts(scan, side, min(scan.size, side.size))
+        score = max(score, starts[0].score)
+        for start in starts:
+            if start.score < LEAST_SCORE:
+                break
+            T = rigid_transform(np.eye(3), camera) @ start.T
+            with suppress(InputError):  # hardly any of it lies there
+                pose = _fit_start(few, few_normals, surface, T, sigma_mm)
+                if best is None or pose.cost < best.cost:
+                    best = pose
+        if best is not None and best.is_good:
             break
-    if best is None and isinstance(refusal, Refused):
-        raise refusal.with_context(
-            "The scan could not be aligned to the nominal model: see that it shows this part, at"
-            " this size, and that little else is in view. One of the tries ended so:"
-        )
     if best is None:
-        raise refusal or SlviewerError(
-            "The nominal model shows no side that a scan could lie on: check the file."
-        )
-    return best
-
-
-def _register_symmetric(scan: PreparedScan, reference: PreparedScan) -> Registration:
-    """Register as ``register_prepared``; of a part with symmetries return the pose of least
-    residuals: the choice among them does not change the deviations."""
-    size = min(scan.size, reference.size)
-    starts = search_starts(scan, reference, size)
-    if starts[0].score < LEAST_SCORE:
         raise Refused(
             "overlap",
-            f"At most {100 * starts[0].score:.0f} % of the scan lies on a side of the model, in any"
+            f"{NOT_ALIGNED}: at most {100 * score:.0f} % of it lies on a side of the model, in any"
             " of its poses.",
         )
-    try:
-        return register_prepared(scan, reference, size, starts)
-    except Refused as error:
-        if error.reason != "ambiguous":
-            raise
-        refusal = error
-    alike = []
-    for start in starts[:MOST_ATTEMPTS]:
-        try:
-            given = replace(start, start="initial")
-            alike.append(register_prepared(scan, reference, size, given))
-        except Refused:
-            continue
-    if not alike:
-        raise refusal
-    return min(alike, key=lambda result: result.rms_mm / result.overlap)
+    _refuse_if_doubtful(best)
+    shape = _find_freedom(few, few_normals, surface, best, MOST_SLACK * scan.size)
+    if shape is not None:
+        raise Refused(
+            shape,
+            f"The scan could not be aligned to the nominal model: what it shows of it"
+            f" {WORDS[shape]}, so that nothing holds the pose: scan edges, corners or bumps of the"
+            " part too, or merge scans of several sides.",
+        )
+    return best.T
+
+
+def _list_sides(
+    surface: NominalSurface, has_camera: bool, report: Progress
+) -> Iterator[tuple[PreparedScan, Floats]]:
+    """Yield what a camera sees of the nominal from each of `VIEWS`, and its centre (3,) mm; first
+    all of it, from the origin, for a scan without camera."""
+    places, facing = surface.sample(SAMPLES)
+    if not has_camera:
+        yield prepare_scan("nominal model", places, facing, has_camera=False), np.zeros(3)
+    for turn, view in enumerate(VIEWS):
+        report(turn / len(VIEWS))
+        towards = np.where(facing @ view < 0, -1.0, 1.0)[:, None] * facing
+        visible = surface.seen_from(places, towards, view, MIN_FACING_COSINE)
+        if np.count_nonzero(visible) >= MIN_VISIBLE:
+            camera = surface.middle + AWAY * surface.diagonal * view
+            yield prepare_scan("nominal model", places[visible] - camera, towards[visible]), camera
+
+
+NOT_ALIGNED = (
+    "The scan could not be aligned to the nominal model: see that it shows this part, at this size,"
+    " and that little else is in view"
+)
+
+
+def _fit_start(
+    points: Floats,
+    normals: Floats | None,
+    surface: NominalSurface,
+    T: Floats,
+    sigma_mm: float | None,
+) -> NominalPose:
+    """Fit the pose of points (n, 3) from ``T`` (4, 4), coarse to fine, and judge it; InputError
+    where they do not lie on the nominal."""
+    sigma, reach = sigma_mm or 0.0, REACH * surface.diagonal
+    gate, good = max(reach / 3, 3 * sigma), max(GOOD_ERROR * surface.diagonal, 3 * sigma)
+    for within in (3 * gate + 2 * reach, 2 * gate, gate):
+        T = fit_pose(points, normals, surface, T, within, robust=True)[0]
+    near = np.abs(surface.signed(move_points(T, points))[0]) < NEAR * reach
+    off = np.abs(surface.distances(points, normals, T, 4 * gate, either_side=True)[0])
+    behind = np.sum(off < gate) - np.isfinite(surface.distances(points, normals, T, gate)[0]).sum()
+    return NominalPose(
+        T,
+        cost=(1 + behind / len(points)) * float(np.mean(_cap(off / reach))),
+        overlap=float(np.mean(off <= gate)),
+        agreement=float(np.sum(off <= gate) / max(1, np.isfinite(off).sum())),
+        is_good=bool(
+            np.sum(off <= good) >= max(GOOD_OVERLAP * len(points), GOOD_AGREEMENT * np.sum(near))
+        ),
+        gate_mm=gate,
+    )
+
+
+def _cap(off: Floats) -> Floats:
+    """Squares of distances (n,) over the reach, at most 1, also for NaN."""
+    return np.fmin(off**2, 1.0)
+
+
+def _find_freedom(
+    points: Floats, normals: Floats | None, surface: NominalSurface, pose: NominalPose, most: float
+) -> Shape | None:
+    """Classify the shape by the motions of a scan that leave it on the nominal for more than
+    ``most`` mm at its rim; None where it has none.
+
+    Beside the normals of what the scan shows its edges hold it: moved, points lie beyond the
+    surface.
+    """
+    reach = REACH * surface.diagonal
+
+    def mean_square(T: Floats) -> float:
+        """Mean squared distance, mm²."""
+        off, _ = surface.distances(points, normals, T, reach, either_side=True)
+        return reach**2 * float(np.mean(_cap(off / reach)))
+
+    _, moved, J, away = fit_pose(points, normals, surface, pose.T, pose.gate_mm, robust=True)
+    middle = moved.mean(axis=0)
+    radius = rms_length(moved - middle)
+    J = J / np.repeat([radius, 1.0], 3)
+    error = rms(away)
+    freedom = freedom_of(J.T @ J / len(J), error)
+    least = mean_square(pose.T) + error**2
+    slack = freedom.slack_mm.copy()
+    for k in np.flatnonzero(slack > most / 2):
+        turn, shift = most * freedom.motions[k, :3] / radius, most * freedom.motions[k, 3:]
+        moves = (turn_about(sign * turn, middle, sign * shift) for sign in (1, -1))
+        if min(mean_square(move @ pose.T) for move in moves) > least:
+            slack[k] = 0.0
+    return Freedom(np.sort(slack), freedom.motions[np.argsort(slack)]).shape(most)
+
+
+def _refuse_if_doubtful(pose: NominalPose) -> None:
+    """Raise ``Refused`` for a pose that does not fit."""
+    if pose.overlap < LEAST_OVERLAP or pose.agreement < LEAST_AGREEMENT:
+        raise Refused(
+            "disagree",
+            f"{NOT_ALIGNED}: in the best pose only {100 * pose.overlap:.0f} % of it lies on the"
+            f" model, {100 * pose.agreement:.0f} % of the points that face it nearby.",
+        )

@@ -1,7 +1,7 @@
 """A scan against a nominal model: aligned, compared, judged."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -12,11 +12,11 @@ from slviewer.errors import InputError, UsageError
 from slviewer.inspection.deviation import (
     Deviation,
     colour_limit,
+    deviation,
     deviation_colours,
     judge_deviation,
 )
 from slviewer.pipeline.feedback import part, stage
-from slviewer.pipeline.inspect_parts import fit_to_nominal
 from slviewer.pipeline.measure import (
     LoadSurface,
     MeasuredSurface,
@@ -28,6 +28,7 @@ from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.stored_records import placed_file
 from slviewer.records.measurement import (
+    LEAST_AREA,
     DeviationStatistics,
     Measurement,
     NominalDeviation,
@@ -35,7 +36,7 @@ from slviewer.records.measurement import (
     ToleranceVerdict,
 )
 from slviewer.records.record import to_matrix, to_vector
-from slviewer.session.nominal import NOMINALS, Nominal, Units, read_nominal
+from slviewer.session.nominal import NOMINALS, Nominal, Units, check_size, read_nominal
 from slviewer.session.ply import write_ply
 
 MAX_STORED_POINTS = 120_000
@@ -51,6 +52,8 @@ class CompareSettings:
         scan: Name of the capture, or merge/1 and the like for a merge of the session.
         nominal: STL, PLY, OBJ, STEP or 3MF file of the part as it should be.
         tolerance: Plus and minus, mm; the answer is pass, fail, or too close to tell.
+        min_area: Percent of the area that the views can see which have to be measured for an
+            answer; with less it is undecided.
         units: What the file's numbers are; required where its size does not fit the scan's. STEP
             and 3MF state theirs.
         reach: Points farther than this from the nominal, mm, belong to something else (a table, a
@@ -68,6 +71,7 @@ class CompareSettings:
     scan: str
     nominal: Path | str
     tolerance: float | None = None
+    min_area: float = LEAST_AREA
     units: Units | None = None
     reach: float | None = None
     out: Path | str | None = None
@@ -77,6 +81,8 @@ class CompareSettings:
     load: LoadSurface | None = None
 
     def __post_init__(self) -> None:
+        if not 0 <= self.min_area <= 100:
+            raise UsageError(f"--min-area is {self.min_area:g}: give 0 to 100, in percent")
         if self.out is not None and Path(self.out).suffix.lower() != ".ply":
             raise UsageError(
                 f"coloured points are written as .ply, not as {Path(self.out).name}: end its"
@@ -89,7 +95,8 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
     """Compare a scan with a nominal model after best-fit alignment: figures, coloured points,
     pictures in the report.
 
-    The session stores the result as a measurement.
+    The session stores the result as a measurement. Ends with status 1 where a tolerance is exceeded
+    or that is undecided.
     """
     store = job.store
     path = Path(settings.nominal)
@@ -106,6 +113,13 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
     )
     aligning = stage(job.progress, 0.4, 0.9, "aligning")
     result = fit_to_nominal(on, nominal, settings.reach, aligning)
+    if result.turned:
+        note = (
+            f"{result.turned:,} of {len(nominal.mesh.faces):,} triangles faced away from the scan,"
+            " which shows the outside alone: they were turned"
+        )
+        job.warn(f"{nominal.name}: {note}")
+        nominal = replace(nominal, notes=(*nominal.notes, note))
     if result.coverage < LIKELY_COVERAGE:
         job.warn(
             f"only {100 * result.coverage:.1f} % of {nominal.name} were measured: see that it is"
@@ -114,7 +128,9 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
     towards = np.nan_to_num(result.normals.astype(np.float64))
     verdict = None
     if settings.tolerance is not None:
-        verdict = judge_deviation(result, on.sigma_along(towards, whole=True), settings.tolerance)
+        verdict = judge_deviation(
+            result, on.sigma_along(towards, whole=True), settings.tolerance, settings.min_area
+        )
     described = _describe(nominal, result, on.sigma_along(towards), verdict)
     place, folder = path.expanduser().absolute(), store.folder.absolute()
     recorded = place.relative_to(folder) if place.is_relative_to(folder) else place
@@ -142,6 +158,29 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         arrays = _list_arrays(on.points[on.measured], result)
         yield Found("", record, arrays, (place,), (note,), settings=used)
     job.progress(1.0, "compared")
+
+
+def fit_to_nominal(
+    surface: MeasuredSurface,
+    nominal: Nominal,
+    reach_mm: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Deviation:
+    """Align a surface by the best fit to the nominal model; ``reach_mm`` as in `deviation`. Raises
+    SlviewerError where that cannot be trusted."""
+    measured, normals = surface.measured, surface.normals
+    points, sigma = surface.points[measured].astype(np.float64), surface.sigma_mm[measured]
+    check_size(nominal, points)
+    return deviation(
+        points,
+        nominal.mesh,
+        normals=None if normals is None else normals[measured].astype(np.float64),
+        sigma_mm=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None,
+        reach_mm=reach_mm,
+        views=surface.views,
+        progress=progress,
+        has_camera=bool(surface.model),
+    )
 
 
 def _describe(

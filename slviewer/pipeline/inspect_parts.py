@@ -14,7 +14,7 @@ from scipy.stats import chi2, norm
 
 from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.geometry.rigid import Uncertainty, move_points
-from slviewer.inspection.deviation import Deviation, deviation, judge_limits
+from slviewer.inspection.deviation import NominalArea, judge_limits
 from slviewer.inspection.features import Feature, relation
 from slviewer.inspection.fitting import (
     FeatureFit,
@@ -27,6 +27,7 @@ from slviewer.inspection.form import form_error, orientation_error, position_err
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import PointErrors
+from slviewer.pipeline.compare import fit_to_nominal
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
@@ -63,7 +64,7 @@ from slviewer.session.inspection_plan import (
     write_plan,
 )
 from slviewer.session.layout import is_session
-from slviewer.session.nominal import NOMINALS, Nominal, check_size, read_nominal
+from slviewer.session.nominal import NOMINALS, Nominal, read_nominal
 from slviewer.session.store import Session
 
 Load = Callable[[Progress], MeasuredSurface]
@@ -178,7 +179,7 @@ def inspect_surfaces(
                 aligned = AlignedPart(plan, surface, nominal)
             except SlviewerError as error:
                 raise InputError(f"not aligned: {error}") from error
-            results = tuple(_measure(each, aligned) for each in plan.characteristic)
+            results = tuple(_measure(each, aligned, plan.min_area) for each in plan.characteristic)
         except SlviewerError as error:
             if error.exit_status == 130:  # cancelled
                 raise
@@ -318,14 +319,15 @@ class AlignedPart:
         self._surface = surface
         self._scan_points = surface.points[surface.measured].astype(np.float64)
         self._nominal_surface: NominalSurface | None = None
+        self._area: NominalArea | None = None
         self._reach = np.inf
         self.T_part_scan: np.ndarray = np.eye(4)
         self.spread: Uncertainty | None = None
         if not len(self._scan_points):
             raise InputError(f"{surface.source} has no measured points: scan the part again.")
         if nominal is not None:
-            self._nominal_surface = NominalSurface(nominal.mesh)
             result = fit_to_nominal(surface, nominal)
+            self._nominal_surface, self._area = result.surface, result.area
             self.T_part_scan, self.spread = result.T_nominal_scan, result.alignment_spread
             self._reach = result.reach_mm
         if plan.alignment.kind == "3-2-1":
@@ -351,6 +353,13 @@ class AlignedPart:
         fitted = [name for name in names if self.features[name].kind != "surface"]
         found = [warning for name in fitted for warning in self.feature(name).warnings]
         return [*self.errors.warnings, *dict.fromkeys(found)]
+
+    def percent_measured(self, name: str) -> float | None:
+        """Percent of a feature's area that the scan's views can see and was measured; None where
+        that is not known."""
+        if self._area is None:
+            return None
+        return self._area.percent_measured(self.features[name].region.within(self._area.places))
 
     @property
     def errors(self) -> PointErrors:
@@ -391,31 +400,9 @@ class AlignedPart:
         return face_towards(fit, towards)
 
 
-def fit_to_nominal(
-    surface: MeasuredSurface,
-    nominal: Nominal,
-    reach_mm: float | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> Deviation:
-    """Align a surface by the best fit to the nominal model; ``reach_mm`` as in `deviation`. Raises
-    SlviewerError where that cannot be trusted."""
-    measured, normals = surface.measured, surface.normals
-    points, sigma = surface.points[measured].astype(np.float64), surface.sigma_mm[measured]
-    check_size(nominal, points)
-    return deviation(
-        points,
-        nominal.mesh,
-        normals=None if normals is None else normals[measured].astype(np.float64),
-        sigma_mm=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None,
-        reach_mm=reach_mm,
-        progress=progress,
-        has_camera=bool(surface.model),
-    )
-
-
-def _measure(wanted: Characteristic, part: AlignedPart) -> CharacteristicResult:
-    """Measure and judge one characteristic; where that is impossible the result holds the
-    reason."""
+def _measure(wanted: Characteristic, part: AlignedPart, min_area: float) -> CharacteristicResult:
+    """Measure and judge one characteristic; where that is impossible, or too little was measured,
+    the result holds the reason."""
     try:
         quantity = measure_characteristic(wanted, part)
     except (SlviewerError, np.linalg.LinAlgError) as error:
@@ -424,9 +411,18 @@ def _measure(wanted: Characteristic, part: AlignedPart) -> CharacteristicResult:
     if U is None or not np.isfinite(value + U):
         return _undecided(wanted, "its uncertainty is not known")
     decision = judge_limits(value, U, wanted.lower, wanted.upper)
-    doubts = "; ".join(part.doubts(wanted.features))
+    doubts = part.doubts(wanted.features)
+    for name in wanted.features:
+        percent = part.percent_measured(name)
+        if percent is not None and percent < min_area:
+            decision = "undecided"
+            doubts.append(
+                f"{percent:.1f} % of the area of {name} that the views can see was measured, and"
+                f" {min_area:g} % are needed: scan what is missing and merge, or give a smaller"
+                " min_area in the plan"
+            )
     whole = quantity.whole and bool(part.errors.calibration)
-    return CharacteristicResult(wanted.name, value, U, decision, doubts, whole)
+    return CharacteristicResult(wanted.name, value, U, decision, "; ".join(doubts), whole)
 
 
 def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantity:

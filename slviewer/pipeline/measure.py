@@ -11,6 +11,7 @@ import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError, UsageError
+from slviewer.geometry.rigid import move_points
 from slviewer.inspection.features import KINDS, Feature, distance, relation
 from slviewer.inspection.fitting import NO_ERRORS, fit_feature
 from slviewer.inspection.regions import Region
@@ -21,6 +22,7 @@ from slviewer.pipeline.models import (
     ModelName,
     available_models,
     check_accepted,
+    device_centres,
     load_model,
     load_stereo,
     preferred_model,
@@ -75,14 +77,14 @@ Place = tuple[int, int] | int
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSurface:
-    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was
-    measured.
+    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where not measured.
 
     ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along
     ``normals`` for a merged surface; ``left_mm`` likewise: standard deviation from the calibration
-    and a misfit of the axes, where known. ``faces`` (m, 3): of a merged mesh. ``source`` is the
-    capture or result that it came from, ``model`` the calibration, ``inputs`` the hashes of both;
-    ``errors``: those that the points share, where known, by the hash of the calibration.
+    and a misfit of the axes. ``faces`` (m, 3): of a merged mesh. ``source`` is the capture or
+    result that it came from, ``model`` the calibration, ``inputs`` the hashes of both; ``errors``:
+    those that the points share, by the hash of the calibration. ``views``: of each scan the centres
+    (2, 3) mm of camera and projector. Each where known.
     """
 
     points: np.ndarray
@@ -96,6 +98,7 @@ class MeasuredSurface:
     errors: PointErrors = NO_ERRORS
     texture: np.ndarray | None = None
     scale: float = 1.0
+    views: Sequence[np.ndarray] = ()
 
     @property
     def organised(self) -> bool:
@@ -220,16 +223,17 @@ def surface_from_cloud(
         errors=PointErrors(shared, "" if shared is None else inputs[calibration], response),
         texture=cloud.texture,
         scale=scale,
+        views=device_centres(store),
     )
 
 
 def load_merged_surface(
     store: Session, merge: str, warn: Warn = ignore_warnings, roi: str = ""
 ) -> MeasuredSurface:
-    """A stored merge ``merge/<number>``, in the frame of its reference's camera; ``roi`` as in
-    `read_merge`."""
+    """A stored merge, in the frame of its reference's camera; ``roi`` as in `read_merge`."""
     record, points = read_merge(store, merge, warn, roi)
     sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))
+    poses = [np.eye(4), *(np.array(pair.T_reference_scan) for pair in record.pairs.values())]
     return MeasuredSurface(
         points.points,
         sigma,
@@ -240,6 +244,7 @@ def load_merged_surface(
         faces=points.faces,
         texture=points.colours,
         scale=record.scales.get(record.model, 1.0),
+        views=[move_points(T, view) for view in device_centres(store) for T in poses],
     )
 
 

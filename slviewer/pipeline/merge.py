@@ -35,6 +35,7 @@ from slviewer.records.merge import (
     Placement,
     RefusedPair,
     Registered,
+    rests_on_start,
 )
 from slviewer.records.record import to_matrix, to_vector
 from slviewer.registration.markers import (
@@ -309,6 +310,9 @@ def _list_warnings(
                 f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the"
                 " scans, and is ignored: glue it on, or take it away"
             )
+    for (a, b), each in registered.alignment.pairs.items():
+        if each.rival_mm is not None:
+            yield rests_on_start(a, b, each.start, each.rival_mm)
     yield from registered.alignment.dropped.values()
     still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
     if still:
@@ -364,7 +368,7 @@ def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Me
 def _make_registered(scan: str, onto: str, registration: Registration) -> Registered:
     """Return the figures of a registration."""
     uncertainty = registration.uncertainty
-    same = ("rms_mm", "overlap", "agreement", "slack_mm", "gate_mm", "start")
+    same = ("rms_mm", "overlap", "agreement", "slack_mm", "gate_mm", "start", "rival_mm")
     return Registered(
         scan=scan,
         onto=onto,
@@ -428,7 +432,7 @@ def _initial_alignments(
         others = [name for name in names if name != base]
         if all((name, base) in picks for name in others):
             poses = {base: np.eye(4)} | {name: picks[name, base].T for name in others}
-    return Starts(poses=poses, table_deg=table_deg, axis=settings.axis, picked=picks)
+    return Starts(poses, settings.start == "placed", table_deg, settings.axis, picks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import CalibrationRejected, InputError, SessionError
+from slviewer.errors import CalibrationRejected, InputError, SessionError, SlviewerError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
@@ -147,6 +147,16 @@ def lens_warnings(store: Session, capture: Capture) -> tuple[str, ...]:
                 " which does not hold for another one: set it back, or calibrate as it is now"
             )
     return tuple(warnings)
+
+
+def device_centres(store: Session) -> list[np.ndarray]:
+    """Return the centres (2, 3) mm of camera and projector, in the camera's frame; [] where no
+    calibration states them."""
+    try:
+        rig = load_stereo(store).rig
+    except SlviewerError:
+        return []
+    return [np.stack([np.zeros(3), -rig.R.T @ rig.t])]
 
 
 def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:

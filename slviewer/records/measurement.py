@@ -48,6 +48,8 @@ class Quantity:
 What = Literal[
     "point", "distance", "section", "plane", "sphere", "cylinder", "relation", "deviation"
 ]
+LEAST_AREA = 90.0
+"""Percent of the area that the views can see which a verdict needs."""
 DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
 RULE = (
     "decided with a guard band as in ISO 14253-1: pass if the deviations of 99.7 % of the points"
@@ -135,7 +137,8 @@ class ToleranceVerdict:
     ``lowest`` and ``highest``: the ends of the range of 99.7 % of the points, each with its
     decision; ``decision`` of both. Percent of the points that lie ``within`` it, ``inside`` it by
     more than U, ``outside`` it by more than U, and too ``close`` to tell. ``U_mm``: expanded
-    uncertainty (k = 2) of a point, in the median.
+    uncertainty (k = 2) of a point, in the median. ``area``: percent of the area that the views can
+    see which was measured; below ``least_area`` nothing is decided.
     """
 
     tolerance_mm: float
@@ -147,10 +150,19 @@ class ToleranceVerdict:
     inside: float
     outside: float
     close: float
+    area: float | None = None
+    least_area: float = 0.0
 
     def text(self) -> str:
         """Return the decision in words."""
-        return f"Tolerance ± {self.tolerance_mm:g} mm: {DECIDED[self.decision]}"
+        decided = DECIDED[self.decision]
+        if self.area is not None and self.area < self.least_area:
+            decided = (
+                f"undecided: {self.area:.1f} % of the area that the views can see was measured, and"
+                f" {self.least_area:g} % are needed; see that the scan shows this part, scan what"
+                " is missing and merge, or give a smaller --min-area"
+            )
+        return f"Tolerance ± {self.tolerance_mm:g} mm: {decided}"
 
 
 class NominalDeviation(msgspec.Struct, frozen=True):
@@ -214,6 +226,8 @@ class NominalDeviation(msgspec.Struct, frozen=True):
                 Quantity("outside by more than U", verdict.outside, "%"),
                 Quantity("U of a point, k = 2", verdict.U_mm, "mm"),
             ]
+            if verdict.area is not None:
+                figures.append(Quantity("visible area measured", verdict.area, "%"))
         rows = [
             {
                 "quantity": each.name,
@@ -239,7 +253,7 @@ class NominalDeviation(msgspec.Struct, frozen=True):
                 f" The best fit adds {self.alignment_mm:.4f} mm (1 sigma)."
             ),
             *(f"{warning}." for warning in warnings),
-            *([] if verdict is None else [f"{verdict.text()}, {RULE}."]),
+            *([] if verdict is None else [f"{verdict.text()}. It is {RULE}."]),
         ]
         return Table.of(rows, f"Deviation from nominal: {name}", notes).without_empty()
 
@@ -331,6 +345,12 @@ class Measurement(Record, frozen=True, kw_only=True):
             or self.deviation.verdict is None
             or self.deviation.verdict.decision == "pass"
         )
+
+    @property
+    def failure(self) -> str:
+        """Why `compare` ends with status 1: the verdict, where it is not a pass."""
+        verdict = None if self.deviation is None else self.deviation.verdict
+        return "" if verdict is None or self.is_good else verdict.text()
 
     def summary(self) -> str:
         """Return kind, scan and quantities in one sentence."""

@@ -24,10 +24,19 @@ EXCLUDED = {
 """Why points of scans are not part of the surface."""
 
 
+def rests_on_start(scan: str, onto: str, start: str, rival_mm: float) -> str:
+    """State that the start of a registration decided between poses that fit alike."""
+    return (
+        f"{scan} -> {onto} rests on its start ({start}): another pose, {rival_mm:.3g} mm away, fits"
+        " as well; see that it is right, or put coded markers on the object or beside it and start"
+        " from markers"
+    )
+
+
 class Registered(msgspec.Struct, frozen=True, kw_only=True):
     """The registration of one scan onto another: RMS along the normal, and from point to point;
     ``overlap``, 0 to 1; one standard deviation of the pose at ``middle``, the centre of the
-    overlap."""
+    overlap. ``rival_mm``: distance of another pose that fits as well: the ``start`` decided."""
 
     scan: str = ""
     onto: str = ""
@@ -39,6 +48,7 @@ class Registered(msgspec.Struct, frozen=True, kw_only=True):
     slack_mm: float | None = None
     gate_mm: float | None = None
     start: str = ""
+    rival_mm: float | None = None
     sigma_shift_mm: float | None = None
     sigma_turn_deg: float | None = None
     middle: Vector | None = None
@@ -213,6 +223,11 @@ class Merge(Record, frozen=True, kw_only=True):
             else f", {100 * self.shared:.0f} % of them seen by several scans"
         )
         notes = [f"{self.points:,} points in the frame of {self.reference}{shared}."]
+        notes += [
+            f"{rests_on_start(each.scan, each.onto, each.start, each.rival_mm)}."
+            for each in self.registered
+            if each.rival_mm is not None
+        ]
         notes += [f"Excluded: {each.why}." for each in self.dropped]
         notes += [
             f"Not registered: {each.scan} onto {each.onto}: {each.why}." for each in self.refused

@@ -17,7 +17,7 @@ from threading import Lock
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Floats, Uncertainty, move_points
+from slviewer.geometry.rigid import Floats, Uncertainty, move_points, rotation_angle
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.records.merge import LoopClosure
@@ -28,6 +28,7 @@ from slviewer.registration.pairwise import Progress, Registration, register_prep
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import LEAST_POINTS, PreparedScan, away_from_edges, prepare_scan
 from slviewer.registration.start import (
+    MAX_ANGLE_ERROR_DEG,
     Candidate,
     TurntableAxis,
     determines_axis,
@@ -54,13 +55,15 @@ _LOOP_OVERLAP = 0.3
 class Starts:
     """Initial alignments of a multiway registration; by features where nothing is given.
 
-    ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame. ``table_deg``: the
+    ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame; ``is_decided``: they
+    follow from registrations. ``table_deg``: the
     angle of a turntable by name, of some of the scans at least; ``axis``: its axis, None to
     estimate it from the first pairs. ``picked``: initial poses from picked points, by pair.
     ``markers``: coded markers by name, which give initial poses and constrain the registration.
     """
 
     poses: Mapping[str, Floats] | None = None
+    is_decided: bool = False
     table_deg: Mapping[str, float] | None = None
     axis: TurntableAxis | None = None
     picked: Mapping[Pair, Candidate] | None = None
@@ -190,17 +193,27 @@ class _PoseGraphBuilder:
         """Return T_world_scan (4, 4) mm by name from given poses or the turntable, and its origin;
         {} without these."""
         if self.starts.poses is not None:
-            return {name: Candidate(T, "initial") for name, T in self.starts.poses.items()}
+            decided = self.starts.is_decided
+            return {
+                name: Candidate(T, "initial", is_decided=decided)
+                for name, T in self.starts.poses.items()
+            }
         table_deg = self.starts.table_deg
         if not table_deg:
             return {}
         angles = {name: table_deg[name] for name in self.names if name in table_deg}
         axis = self.starts.axis or self._estimate_axis(angles)
-        return {name: Candidate(axis.rotation(-deg), "turntable") for name, deg in angles.items()}
+        decided = self.starts.axis is None and all(
+            result.rival_mm is None for result in self.registered.values()
+        )
+        return {
+            name: Candidate(axis.rotation(-deg), "turntable", is_decided=decided)
+            for name, deg in angles.items()
+        }
 
     def _estimate_axis(self, angles: Mapping[str, float]) -> TurntableAxis:
         """Estimate the turntable's axis from the first two consecutive pairs that register by
-        features.
+        features, or from one whose ambiguity the table's angle decides.
 
         ``angles``: of the table, degrees, by name.
         """
@@ -209,11 +222,13 @@ class _PoseGraphBuilder:
         usable = {pair: deg for pair, deg in given.items() if determines_axis(deg)} or given
         for pair, deg in usable.items():
             self._register({pair: None})
+            if pair in self.refused and self.refused[pair].reason == "ambiguous":
+                self._register_turned(pair, abs(deg))
             if pair in self.registered:
                 steps.append(self.registered[pair].T_reference_scan)
                 steps_deg.append(deg)
-            if len(steps) == 2:
-                break
+                if len(steps) == 2 or self.registered[pair].rival_mm is not None:
+                    break
         if not steps:
             raise Refused(
                 "overlap",
@@ -221,6 +236,15 @@ class _PoseGraphBuilder:
                 "give the axis, or scan at smaller steps.",
             )
         return fit_turntable_axis(steps, steps_deg)
+
+    def _register_turned(self, pair: Pair, deg: float) -> None:
+        """Register a pair whose poses fit alike from the best one that turns by ``deg``."""
+        a, b = (self.scans[self.names.index(name)] for name in pair)
+        for start in search_starts(a, b, self.size):
+            turned_deg = float(np.degrees(rotation_angle(start.T[:3, :3])))
+            if abs(turned_deg - deg) < MAX_ANGLE_ERROR_DEG:
+                self._register({pair: replace(start, start="turntable")})
+                return
 
     def _fit_markers(self) -> dict[Pair, MarkerPose]:
         """Fit the poses of pairs with common markers: of a few scans all, of many each scan's
@@ -291,7 +315,7 @@ class _PoseGraphBuilder:
         for overlap, (a, b), T in sorted(overlaps, key=lambda entry: -entry[0]):
             if overlap >= _LOOP_OVERLAP and max(count[a], count[b]) < _LOOP_PAIRS:
                 count.update((a, b))
-                pairs[a, b] = Candidate(T, "initial")
+                pairs[a, b] = Candidate(T, "initial", is_decided=True)
         self._register(pairs)
 
     # registration of pairs
@@ -431,7 +455,8 @@ class _PoseGraphBuilder:
         gate."""
         T = np.linalg.inv(poses[edge.onto]) @ poses[edge.scan]
         result = self._align(
-            (self.names[edge.scan], self.names[edge.onto]), Candidate(T, "initial")
+            (self.names[edge.scan], self.names[edge.onto]),
+            Candidate(T, "initial", is_decided=True),
         )
         if isinstance(result, Refused):
             return False
@@ -446,7 +471,7 @@ def _relative_pose(known: Mapping[str, Candidate], scan: str, onto: str) -> Cand
     known."""
     if scan not in known or onto not in known:
         return None
-    return Candidate(np.linalg.inv(known[onto].T) @ known[scan].T, known[scan].start)
+    return replace(known[scan], T=np.linalg.inv(known[onto].T) @ known[scan].T)
 
 
 def _estimate_overlap(scan: PreparedScan, reference: PreparedScan, T: Floats) -> float:

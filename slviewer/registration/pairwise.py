@@ -6,6 +6,7 @@ slides on a plane, a sphere turns in a sphere), and no other pose fits as well.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,9 +40,12 @@ LEAST_MARKERS = 2
 """In common, without overlap: of one alone nobody could tell that it was moved."""
 MOST_MARKER_ERROR = 1 / 300
 """Of the object's size: what markers alone may leave open at its rim (1 sigma)."""
-RIVAL_SCORE, RIVAL_OVERLAP, RIVAL_RMS = 0.7, 0.6, 1.25
-"""A rival comes to so much of the best pose's score and overlap, and to at most so many times its
-RMS."""
+RIVAL_SCORE, RIVAL_OVERLAP, RIVAL_RMS, RIVAL_GATES = 0.7, 0.6, 1.25, 2.0
+"""A rival comes to so much of the best pose's score and overlap, to at most so many times its RMS,
+and lies more than so many gates away."""
+DECISIVE = 10.0
+"""A given start decides between poses that fit alike where the others are so many times as far from
+it."""
 _STATISTICS_POINTS = 50_000
 
 
@@ -59,6 +63,7 @@ class Registration:
     holds the pose: how far the scan would have to slide or turn (at the overlap's rim) in its
     loosest direction until the surfaces come apart by ``rms_mm``. It is large for planes and
     spheres, and always far larger than the pose's error, which ``uncertainty`` estimates.
+    ``rival_mm``: distance of another pose that fits as well, so that the start alone decides.
     """
 
     T_reference_scan: Floats
@@ -70,6 +75,7 @@ class Registration:
     gate_mm: float
     start: Start
     uncertainty: Uncertainty
+    rival_mm: float | None = None
 
 
 def register_prepared(
@@ -83,12 +89,13 @@ def register_prepared(
     """Align a scan with a reference that shows part of the same object, of ``size`` mm.
 
     ``start``: the initial pose, or the result of an earlier ``search_starts``, which is run
-    otherwise. ``markers``: those that both scans show, from whose pose it starts, and which hold
-    what the shape leaves open; alone, where the surfaces do not overlap. ``progress`` receives the
-    share of the work done, 0 to 1, and may raise to cancel.
+    otherwise, and where the initial pose leads nowhere. ``markers``: those that both scans show,
+    from whose pose it starts, and which hold what the shape leaves open; alone, where the surfaces
+    do not overlap. ``progress`` receives the share of the work done, 0 to 1, and may raise to
+    cancel.
 
     Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not
-    hold the pose, or where a second pose fits alike.
+    hold the pose, or where a second pose fits alike, between which a given start does not decide.
     """
     if markers is not None:
         progress(0.4)
@@ -105,11 +112,19 @@ def register_prepared(
             if error.reason in WORDS:
                 break
             continue
-        if candidate.start in SEARCHED:
+        if not candidate.is_decided:
             others = starts[attempt + 1 : MOST_ATTEMPTS + 1]
-            _refuse_rivals(scan, reference, result, candidate, others, size)
+            if candidate.start not in SEARCHED:
+                others = search_starts(scan, reference, size)[: MOST_ATTEMPTS + 1]
+            rival = _find_rival(scan, reference, result, candidate.score, others, size)
+            if rival is not None:
+                given = start if isinstance(start, Candidate) else None
+                result = replace(result, rival_mm=_check_rival(scan, result, rival, given))
         progress(1.0)
         return result
+    if isinstance(start, Candidate) and not start.is_decided:
+        with suppress(Refused):  # the start was wrong
+            return register_prepared(scan, reference, size)
     raise refusals[0]  # the best start's refusal says most
 
 
@@ -232,34 +247,54 @@ def _refuse_if_doubtful(result: Registration, held: Freedom | None, size: float)
         )
 
 
-def _refuse_rivals(
+def _find_rival(
     scan: PreparedScan,
     reference: PreparedScan,
     result: Registration,
-    start: Candidate,
+    score: float,
     others: list[Candidate],
     size: float,
-) -> None:
-    """Raise ``Refused`` where ICP from one of the ``others`` ends at a different pose that fits
-    equally well."""
+) -> Registration | None:
+    """Return the result of ICP from the first of the ``others`` that ends at a different pose, and
+    fits as well; ``score``: of the result's own start."""
     for other in others:
-        if not other.score >= RIVAL_SCORE * start.score:
+        if not other.score >= RIVAL_SCORE * score:
             continue
         try:
             rival = _refine_start(scan, reference, other, size)
         except Refused:
             continue
         gap = pose_distance(scan.fine_points, result.T_reference_scan, rival.T_reference_scan)
-        distinct = gap > max(5.0 * result.gate_mm, 10.0 * result.uncertainty.shift_mm)
+        distinct = gap > max(RIVAL_GATES * result.gate_mm, 10.0 * result.uncertainty.shift_mm)
         alike = (
             rival.overlap >= RIVAL_OVERLAP * result.overlap
             and rival.rms_mm <= RIVAL_RMS * result.rms_mm
         )
         if distinct and alike:
-            raise Refused(
-                "ambiguous",
-                f"Two poses fit alike, with an RMS of {result.rms_mm:.3f} and {rival.rms_mm:.3f} mm"
-                f" over {100 * result.overlap:.0f} and {100 * rival.overlap:.0f} % of the scan, and"
-                f" they lie {gap:.0f} mm apart: pick three point pairs, give the turntable's angle,"
-                " or put something beside the object that tells one side from the other.",
-            )
+            return rival
+    return None
+
+
+def _check_rival(
+    scan: PreparedScan, result: Registration, rival: Registration, start: Candidate | None
+) -> float:
+    """Return how far, mm, a rival lies from a result; raises ``Refused`` unless the given ``start``
+    decides between the two."""
+    poses = result.T_reference_scan, rival.T_reference_scan
+    gap = pose_distance(scan.fine_points, *poses)
+    undecided = ""
+    if start is not None:
+        near, far = (pose_distance(scan.fine_points, start.T, T) for T in poses)
+        if far > DECISIVE * near:
+            return gap
+        undecided = (
+            f"; the given start, {near:.1f} and {far:.1f} mm from them, does not decide between"
+            " the two"
+        )
+    raise Refused(
+        "ambiguous",
+        f"Two poses fit alike, with an RMS of {result.rms_mm:.3f} and {rival.rms_mm:.3f} mm"
+        f" over {100 * result.overlap:.0f} and {100 * rival.overlap:.0f} % of the scan, and"
+        f" they lie {gap:.0f} mm apart{undecided}: put coded markers on the object or beside it"
+        " and start from markers, pick three point pairs, or give the turntable's angle.",
+    )

@@ -252,7 +252,12 @@ def estimate_freedom(
     arm = points - points.mean(axis=0)
     arm /= rms_length(arm)
     A, B = distance_jacobian(arm, reference_normals), distance_jacobian(arm, scan_normals)
-    information = A.T @ B / len(points)
+    return freedom_of(A.T @ B / len(points), rms)
+
+
+def freedom_of(information: Floats, rms: float) -> Freedom:
+    """The freedom that the information (6, 6) of a point in the mean leaves, of rotations with
+    lengths in units of the overlap's radius; ``rms``: noise in mm."""
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     slack = rms / np.sqrt(np.maximum(values, 1e-12))
     return Freedom(slack[::-1], vectors.T[::-1])

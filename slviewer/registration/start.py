@@ -6,7 +6,7 @@ RANSAC is our own, in NumPy, because Open3D's parallel one gives another answer 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -46,12 +46,13 @@ class Candidate:
     """An initial pose ``T`` (4, 4), T_reference_scan, and its origin ``start``.
 
     ``score``: 0 to 1, share of the thinned scan that fits the reference at this pose; NaN if not
-    evaluated.
+    evaluated. ``is_decided``: it follows from registrations, and no other pose can be meant.
     """
 
     T: Floats
     start: Start
     score: float = float("nan")
+    is_decided: bool = False
 
 
 def search_starts(
@@ -82,9 +83,8 @@ def search_starts(
                 sparse_scan, reference, T, gate, open3d().pipelines.registration.L2Loss(), 1e-5, 20
             )
         if all(pose_distance(np.asarray(scan.points), T, other.T) > 0.5 * voxel for other in found):
-            found.append(
-                Candidate(T, candidate.start, _score_pose(scan, reference, tree, T, voxel))
-            )
+            score = _score_pose(scan, reference, tree, T, voxel)
+            found.append(replace(candidate, T=T, score=score))
     return sorted(found, key=lambda candidate: -candidate.score)
 
 
@@ -199,7 +199,7 @@ def fit_picked_start(
     return Candidate(T, "picked"), np.asarray(residual)
 
 
-_MAX_ANGLE_ERROR_DEG = 3.0
+MAX_ANGLE_ERROR_DEG = 3.0
 """Largest difference between a measured and a given step of the turntable."""
 
 
@@ -227,7 +227,7 @@ def shortest_turn(deg: float) -> float:
 def determines_axis(deg: float) -> bool:
     """Whether a step of the table by -180 to 180 degrees is far enough from 0 and from 180 to give
     its axis."""
-    return _MAX_ANGLE_ERROR_DEG < abs(deg) < 180.0 - _MAX_ANGLE_ERROR_DEG
+    return MAX_ANGLE_ERROR_DEG < abs(deg) < 180.0 - MAX_ANGLE_ERROR_DEG
 
 
 def fit_turntable_axis(steps: Sequence[Floats], step_deg: ArrayLike) -> TurntableAxis:
@@ -242,14 +242,14 @@ def fit_turntable_axis(steps: Sequence[Floats], step_deg: ArrayLike) -> Turntabl
     if unfit := [deg for deg in given if not determines_axis(deg)]:
         raise InputError(
             f"A turntable's step of {unfit[0]:g} degrees gives no axis: step by"
-            f" {_MAX_ANGLE_ERROR_DEG:g} to {180 - _MAX_ANGLE_ERROR_DEG:g} degrees, either way, or"
+            f" {MAX_ANGLE_ERROR_DEG:g} to {180 - MAX_ANGLE_ERROR_DEG:g} degrees, either way, or"
             " start from features."
         )
     # registration turns the later scan back by the table's step
     turns = np.array([-np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec()) for T in steps])
     angles = lengths(turns)
     for angle, deg in zip(angles, np.abs(given), strict=True):
-        if abs(angle - deg) > _MAX_ANGLE_ERROR_DEG:
+        if abs(angle - deg) > MAX_ANGLE_ERROR_DEG:
             raise InputError(
                 f"Two scans in a row lie {angle:.1f} degrees apart and the turntable is said to"
                 f" step by {deg:g}: check the angle and the order of the scans, or start from"

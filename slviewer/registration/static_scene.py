@@ -117,20 +117,22 @@ def register_object(
         return ObjectAlignment(alignment, clouds, none, {})
     all_samples = _sample_clouds(clouds)
     alignment, static = _register_once(clouds, all_samples, reference, starts, progress)
-    first_start = {pair: registration.start for pair, registration in alignment.pairs.items()}
+    first = {pair[::turn]: r for pair, r in alignment.pairs.items() for turn in (-1, 1)}
     moving, samples = clouds, all_samples
     for _ in range(ROUNDS):
         if not static:
             break
         candidate = remove_points(clouds, static)
-        again = Starts(poses=alignment.T_reference_scan, markers=starts.markers)
+        again = Starts(poses=alignment.T_reference_scan, is_decided=True, markers=starts.markers)
         refined = _try_register(candidate, reference, again, lambda share: progress(0.9))
         # too few points remain of a scan: its background may be needed to determine its pose
         if refined is None:
             moving, samples, static = clouds, all_samples, {}
             break
         pairs = {
-            pair: replace(r, start=first_start.get(pair, r.start))
+            pair: replace(r, start=first[pair].start, rival_mm=first[pair].rival_mm)
+            if pair in first
+            else r
             for pair, r in refined.pairs.items()
         }
         alignment = replace(refined, pairs=pairs)

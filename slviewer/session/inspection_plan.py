@@ -12,6 +12,7 @@ from slviewer.geometry.vectors import unit_vectors
 from slviewer.inspection.features import MEANINGS, Feature
 from slviewer.inspection.regions import Region
 from slviewer.records.inspection import Characteristic
+from slviewer.records.measurement import LEAST_AREA
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.record import Matrix4, Vector
 from slviewer.session.atomic import replace_file
@@ -85,19 +86,23 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Plan:
-    """An inspection plan."""
+    """An inspection plan. ``min_area``: percent of a feature's area, of what the views can see of
+    the nominal model, that has to be measured for a decision."""
 
     name: str
     feature: tuple[PlanFeature, ...]
     characteristic: tuple[Characteristic, ...]
     alignment: Alignment = field(default_factory=Alignment)
     version: int = VERSION
+    min_area: float = LEAST_AREA
 
     def __post_init__(self) -> None:
         if self.version != VERSION:
             raise ValueError(
                 f"the plan has version {self.version}, and this program reads {VERSION}"
             )
+        if not 0 <= self.min_area <= 100:
+            raise ValueError(f"min_area is {self.min_area:g}: give 0 to 100, in percent")
         for what, listed in (("feature", self.feature), ("characteristic", self.characteristic)):
             names = [each.name for each in listed]
             if not names or len(set(names)) < len(names):
@@ -162,7 +167,7 @@ def plan_toml(plan: Plan) -> str:
             " coordinates."
         ),
         "# Limits are absolute values; leave one out where there is none.",
-        *table_lines({"version": plan.version, "name": plan.name}),
+        *table_lines({"version": plan.version, "name": plan.name, "min_area": plan.min_area}),
         "",
         "[alignment]",
         *table_lines(_entries(plan.alignment)),

@@ -516,7 +516,7 @@ class ResultRequests(Engine):
                 f"there is no nominal model {nominal!r} in the session: upload it first"
             )
         load = partial(surface_to_measure, name=on)
-        settings = CompareSettings(on, path, tolerance_mm, units, load=load)
+        settings = CompareSettings(on, path, tolerance_mm, units=units, load=load)
 
         def failed(error: BaseException) -> None:
             """Report why, in the words of the panel."""

@@ -129,6 +129,7 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
         Mesh(box.vertices, box.faces),
         normals=normals @ R.T,
         initial=np.linalg.inv(_pose(R, t)),
+        views=[np.zeros((1, 3))],
     )
     x, y = points[:12_000, 0] - 8, points[:12_000, 1] - 4
     plateau = np.hypot(x, y) < 0.7
@@ -149,6 +150,57 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     )
 
 
+def test_a_verdict_needs_most_of_what_the_views_can_see() -> None:
+    box = Mesh(*(lambda each: (each.vertices, each.faces))(trimesh.creation.box((60, 40, 20))))
+    points, normals = box_scan(0.01)
+    part = (points[:, 0] < 12) | (normals[:, 2] < 0.5)
+    above = [np.array([[0.0, 0.0, 500.0], [200.0, 0.0, 450.0]])]
+    initial = np.eye(4)
+    for chosen, percent, decision in ((part, 73, "undecided"), (part | True, 100, "pass")):
+        found = deviation(
+            points[chosen], box, normals=normals[chosen], initial=initial, views=above
+        )
+        verdict = judge_deviation(found, np.full(chosen.sum(), 0.01), 0.3)
+        assert verdict.area == pytest.approx(percent, abs=4) and verdict.decision == decision
+        assert found.coverage < 0.7  # of all six sides
+        lenient = judge_deviation(found, np.full(chosen.sum(), 0.01), 0.3, 60.0)
+        assert lenient.decision == "pass"
+
+
+def test_triangles_that_a_scan_shows_from_behind_are_turned() -> None:
+    box = trimesh.creation.box((60, 40, 20))
+    points, normals = box_scan(0.01)
+    top = box.face_normals[:, 2] > 0.5
+    for wrong in (top, np.ones(12, bool), np.zeros(12, bool)):
+        faces = np.where(wrong[:, None], box.faces[:, ::-1], box.faces)
+        surface = NominalSurface(Mesh(box.vertices, faces))
+        turned = surface.seen_from_behind(points, normals, np.eye(4), 1.0)
+        assert np.array_equal(turned, wrong)
+    found = deviation(
+        points, Mesh(box.vertices, box.faces[:, ::-1]), normals=normals, initial=np.eye(4)
+    )
+    assert found.turned == 12 and np.nanmax(found.signed[:12_000]) > 0.09  # the bump lies outside
+
+
+@pytest.mark.slow
+@pytest.mark.computes
+def test_a_missing_step_does_not_keep_a_scan_from_its_place() -> None:
+    low, high = trimesh.creation.box((120, 90, 20)), trimesh.creation.box((30, 20, 12))
+    high.apply_translation((-40, 20, 15))
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform([[-60], [-45]], [[60], [45]], (2, 20_000))
+    on_boss = (np.abs(x + 40) < 15) & (np.abs(y - 20) < 10)
+    z = np.where(on_boss, 21.0, 10.0) + np.where((np.abs(x - 20) < 20) & (y < 0), 0.5, 0.0)
+    points = np.column_stack([x, y, z + 0.03 * rng.normal(size=len(x))])
+    normals = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    R, t = rotation(np.radians([175.0, 12.0, 20.0])), np.array([10.0, -5.0, 480.0])
+    part = trimesh.util.concatenate([low, high])
+    found = deviation(points @ R.T + t, Mesh(part.vertices, part.faces), normals=normals @ R.T)
+    wrong = found.T_nominal_scan @ _pose(R, t)
+    assert np.abs(wrong[:2, 3]).max() < 4.0  # nothing but edges holds it there
+    assert 0.35 < found.statistics()["p_high"] < 0.65
+
+
 @pytest.mark.slow
 @pytest.mark.computes
 def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch) -> None:
@@ -164,10 +216,10 @@ def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch)
     )
     # corners; a box has no front
     monkeypatch.setattr(nominal_surface, "VIEWS", nominal_surface.VIEWS[-2:])
-    start = nominal_surface.search_start(
+    start = nominal_surface.search_pose(
         scan, facing, NominalSurface(nominal), None, lambda share: None
     )
-    found = deviation(scan, nominal, normals=facing, initial=start.T_reference_scan)
+    found = deviation(scan, nominal, normals=facing, initial=start)
     assert 0.0095 < found.statistics()["rms"] < 0.0125 and found.statistics()["left_out"] < 100
 
 
@@ -220,7 +272,7 @@ def test_a_scan_without_points_is_refused(ammonite) -> None:
 def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch) -> None:
     monkeypatch.setattr(
         nominal_surface,
-        "register_prepared",
+        "fit_pose",
         lambda *given, **options: pytest.fail("a pose was refined"),
     )
     _, _, points, normals = ammonite
@@ -229,7 +281,7 @@ def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch
     other = NominalSurface(Mesh(box.vertices, box.faces))
     monkeypatch.setattr(nominal_surface, "VIEWS", nominal_surface.VIEWS[:2])
     with raises(Refused, "nominal model", "%") as refusal:
-        nominal_surface.search_start(
+        nominal_surface.search_pose(
             points[seen][::3],
             normals[seen][::3],
             other,

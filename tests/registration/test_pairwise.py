@@ -151,6 +151,21 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
     assert 0.1 < apart.max() < 6.0
     found = register(scan, reference, start)
     assert found.start == "picked" and error(found, T)[0] < 0.03
+    # the other pose is half a turn away, and the result states that the start decided
+    assert found.rival_mm is not None and 100 < found.rival_mm < 250
+    nearer = np.linalg.inv(motion(20, 0)) @ T
+    with raises(Refused, "mm", "start") as refusal:
+        register(scan, reference, Candidate(nearer, "initial"))
+    assert refusal.value.reason == "ambiguous"
+    assert register(scan, reference, Candidate(T, "initial", is_decided=True)).rival_mm is None
+
+
+@pytest.mark.slow
+def test_a_start_that_leads_nowhere_gives_way_to_features() -> None:
+    T = motion(60.0, 150.0)
+    scan, reference = view(bumpy(2), (-45, 75), 1, T), view(bumpy(2), (-75, 45), 2)
+    found = register(scan, reference, Candidate(np.eye(4), "initial"))
+    assert found.start == "features" and error(found, T)[0] < 0.03 and found.rival_mm is None
 
 
 def test_picks_that_fix_no_pose_are_refused() -> None:
