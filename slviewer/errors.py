@@ -43,6 +43,15 @@ class DetectionError(InputError):
     """A target that was not detected in an image."""
 
 
+class BoardError(DetectionError):
+    """A target that was detected, and contradicts its description or is a mirror image; ``cause``:
+    that of the finding."""
+
+    def __init__(self, cause: str, message: str) -> None:
+        super().__init__(message)
+        self.cause = cause
+
+
 class SessionError(SlviewerError):
     """A session folder that cannot be read or written."""
 

@@ -14,6 +14,7 @@ from slviewer.calibration.diagnosis.rules import (
     MIN_TILT_DEG,
 )
 from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY
+from slviewer.calibration.squareness import judge_squareness, measure_squareness
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, check_pose_count
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats, largest_angle_deg, move_points
@@ -123,7 +124,9 @@ def calibrate_camera(
         dict(excluded or {}),
         Verdict(),
     )
-    return replace(unjudged, verdict=Verdict.of(_judge_camera(unjudged, poses)))
+    squareness = measure_squareness(lens, poses, points, pixels)
+    findings = [*_judge_camera(unjudged, poses), *judge_squareness(str(board), squareness)]
+    return replace(unjudged, verdict=Verdict.of(findings))
 
 
 def _solve_camera(

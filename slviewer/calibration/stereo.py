@@ -12,6 +12,7 @@ from slviewer.calibration.known_camera import KnownCamera, Views, solve_beside
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.calibration.observe import Observation
 from slviewer.errors import CalibrationRejected
+from slviewer.examination.findings import mirroring_remedy
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.lens import Lens
@@ -417,8 +418,11 @@ def check_handedness(used: Sequence[Observation]) -> None:
     if mirrored > len(used) / 2:
         raise CalibrationRejected(
             f"in {mirrored} of {len(used)} poses the projector's coordinates are a mirror image of"
-            " what the camera sees: switch off the projector's rear or mirror mode, or exchange"
-            " the x and y (V and H) patterns"
+            " what the camera sees: "
+            + mirroring_remedy(
+                "switch off the projector's rear or mirror mode, or exchange the x and y (V and H)"
+                " patterns"
+            )
         )
 
 

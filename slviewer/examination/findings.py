@@ -277,24 +277,32 @@ def describe_mirroring(sequence: PatternSequence, jacobian: np.ndarray) -> Itera
     """Yield the finding of axes that are exchanged or reversed, by the change (2, 2) of the
     projector's coordinates with the camera's; nothing where they are not mirrored.
 
-    Camera and projector both see the scene from the front, so that neither sees a mirror image.
+    Camera and projector both see the scene from the front, so that neither sees a mirror image:
+    which of them is mirrored, the coordinates do not show.
     """
     if np.linalg.det(jacobian) > 0:
         return
     seen = "the projector's coordinates are a mirror image of what the camera sees"
     if np.abs(np.diag(jacobian[::-1])).sum() > np.abs(np.diag(jacobian)).sum():
         text = f"{seen}, as if x and y were exchanged"
-        yield Finding("axes-swapped", "rejected", text, REMEDIES["axes-swapped"])
+        remedy = mirroring_remedy(REMEDIES["axes-swapped"])
+        yield Finding("axes-swapped", "rejected", text, remedy)
         return
     axis: Axis = "x" if jacobian[0, 0] < 0 else "y"
     text = f"{seen}, as if axis {axis} were reversed"
-    remedy = (
-        f"number the projector's {LINES[axis]} from the other end, or switch off its mirror or rear"
-        " mode"
-    )
+    remedy = "switch off the projector's mirror or rear mode"
     if not sequence.find("gray", axis):
-        remedy = f"set phase_sign = {-sequence.sign(axis)} for axis {axis}, or {remedy}"
-    yield Finding("axis-reversed", "rejected", text, remedy, (), (), axis)
+        remedy += f", or set phase_sign = {-sequence.sign(axis)} for axis {axis}"
+    yield Finding("axis-reversed", "rejected", text, mirroring_remedy(remedy), (), (), axis)
+
+
+def mirroring_remedy(of_projector: str) -> str:
+    """Return the remedy where camera or projector is mirrored, with that for the projector."""
+    return (
+        "look at some text in the camera's image. Where it is mirrored, switch off the camera's"
+        f" mirror (selfie) or flip mode; where it is readable, {of_projector}. A board with a mark"
+        " or a ChArUco board decides it as well"
+    )
 
 
 def describe_reach(axis: Axis, extent: int, coordinate: np.ndarray, share: float) -> Finding:

@@ -151,7 +151,7 @@ def detect_board(
 def _fit_grid(board: Board, detection: Detection, pixels: np.ndarray) -> GridMap:
     """Return the smooth map from the board, in pitches, to the ``pixels`` (n, 2) of what was
     detected."""
-    return fit_grid_map(board.points[detection.ids][:, :2] / board.pitch_mm, pixels)
+    return fit_grid_map(board.nodes[detection.ids], pixels)
 
 
 def draw_detection(board: Board, image: np.ndarray, detection: Detection | None) -> np.ndarray:

@@ -4,7 +4,7 @@ the session as `poses/<name>` and `evidence/<name>`."""
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from slviewer.calibration.diagnosis.frames import (
 )
 from slviewer.calibration.diagnosis.numbering import detect_grid_size
 from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing, observe, pitch_px
-from slviewer.errors import DamagedError, InputError
+from slviewer.errors import BoardError, DamagedError, InputError
 from slviewer.examination.light import Look
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -30,7 +30,7 @@ from slviewer.pipeline.capture_phases import (
 )
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.records.plain import to_plain
-from slviewer.records.verdict import Examination
+from slviewer.records.verdict import Cause, Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -79,7 +79,7 @@ def read_pose(
     name, sequence, frames, phases = pose.name, pose.sequence, pose.look.stack, pose.phases
     detection: Detection | None = None
     observation: Observation | None = None
-    refused = ""
+    refused, cause = "", ""
     try:
         detection = detect(pose.board, pose.texture)
         observation = observe(name, pose.board, detection, phases, smoothing)
@@ -87,11 +87,9 @@ def read_pose(
             observed(observation)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
-    checked = (
-        (examined or partial(examine_frames, sequence, frames, look=pose.look))()
-        if examine
-        else None
-    )
+        cause = error.cause if isinstance(error, BoardError) else ""
+    examine_them = examined or partial(examine_frames, sequence, frames, look=pose.look)
+    checked = examine_them() if examine else None
     if observation is not None:
         try:
             check_capture(name, sequence, frames, phases, checked)
@@ -99,7 +97,7 @@ def read_pose(
             refused = str(error).removeprefix(f"{name}: ")
     evidence = None
     if checked is not None:
-        evidence = gather_evidence(pose, checked, detection, observation, refused)
+        evidence = gather_evidence(pose, checked, detection, observation, refused, cause)
     return Judged(name, None if refused else observation, refused, evidence)
 
 
@@ -226,15 +224,20 @@ def gather_evidence(
     detection: Detection | None,
     observation: Observation | None,
     refused: str,
+    cause: str = "",
 ) -> PoseEvidence:
     """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
-    None where they could not be read, for the reason ``refused``; ``examination``: of its frames.
+    None where they could not be read, for the reason ``refused`` and its ``cause``;
+    ``examination``: of its frames.
     """
     sequence, frames, board = pose.sequence, pose.look.stack, pose.board
     grid, on_board, moved_px = None, None, np.nan
+    is_oriented = False
     if detection is None:
         grid = detect_grid_size(board, pose.texture)
     else:
+        is_marked = detection.marked and board.columns != board.rows  # a square has no mirror image
+        is_oriented = is_marked or board.kind == "charuco"
         on_board = board_mask(board, detection, pose.texture.shape)
         pitch = float(np.median(pitch_px(board, detection)))
         moved_px = measure_motion_px(sequence, frames, detection.pixels, pitch)
@@ -253,4 +256,6 @@ def gather_evidence(
         displaced=measure_white_delay(sequence, frames),
         moved_px=moved_px,
         turn=turn,
+        cause=cast(Cause, cause),
+        upright=is_oriented,
     )

@@ -151,7 +151,10 @@ class BoardScene:
         if board is None:
             return albedo
         if board.kind == "chessboard":
-            column, row = (np.floor(each[inside] / board.pitch_mm) for each in (x, y))
+            column, row = (
+                np.floor(each[inside] / pitch)
+                for each, pitch in zip((x, y), board.pitches, strict=True)
+            )
             dark = (column >= -1) & (column < board.columns) & ((column + row) % 2 == 0)
             dark &= (row >= -1) & (row < board.rows)
         else:

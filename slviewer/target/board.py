@@ -9,8 +9,11 @@
                                differ from the defaults, ``:marker mm`` (0.75 of the square) and
                                ``:dictionary`` (DICT_5X5_1000). The layout is OpenCV's since 4.6:
                                the top-left square is dark
+``charuco-legacy:8x6:30``      the layout before OpenCV 4.6: with an even number of rows, the
+                               top-left square is bright
 =============================  =====================================================================
 
+Where the print's pitch differs along x and y, both are given, as in ``circles:21x16:9.05x9``.
 Plugins add others (`BoardType`).
 """
 
@@ -35,11 +38,15 @@ EXAMPLES = {
     "acircles": "acircles:4x11:20",
     "chessboard": "chessboard:9x7:75",
     "charuco": "charuco:8x6:30",
+    "charuco-legacy": "charuco-legacy:8x6:30",
 }
 _OUTLINE_SQUARES = {"circles": 0.5, "acircles": 0.5, "chessboard": 0.95, "charuco": 1.0}
 DEFAULT_DICTIONARY = "DICT_5X5_1000"
 DEFAULT_MARKER = 0.75
 """Side of a ChArUco marker in squares."""
+LEGACY = "charuco-legacy"
+MAX_STRETCH = 1.5
+"""Largest ratio of the pitches along x and y."""
 _DICTIONARY = re.compile(r"DICT_([4-7])X\1_(50|100|250|1000)")
 
 
@@ -91,8 +98,9 @@ class Board:
 
     ``points``: the features, row by row: x along a row, y along a column, so that the normal (x
     cross y) points away from a camera that sees the printed side; the first feature is the origin.
-    ``marker_mm`` and ``dictionary`` belong to ChArUco boards only. ``kind``: a `Kind`, or the name
-    of a plugin's `BoardType`.
+    ``marker_mm``, ``dictionary`` and ``legacy``, the layout before OpenCV 4.6, belong to ChArUco
+    boards only. ``kind``: a `Kind`, or the name of a plugin's `BoardType`. ``pitch_mm``: along x;
+    ``pitch_y_mm``: along y, by default the same.
     """
 
     kind: str
@@ -101,6 +109,8 @@ class Board:
     pitch_mm: float
     marker_mm: float = 0.0
     dictionary: str = ""
+    pitch_y_mm: float = 0.0
+    legacy: bool = False
 
     def __post_init__(self) -> None:
         example = _find_example(self.kind)
@@ -109,21 +119,42 @@ class Board:
                 f"there is no board of kind '{self.kind}': use one of {', '.join(board_examples())}"
                 + BOARD_PLUGINS.explain_missing(self.kind)
             )
+        if self.kind == LEGACY:
+            object.__setattr__(self, "kind", "charuco")
+            object.__setattr__(self, "legacy", True)
         fewest = {"acircles": (2, 3)}.get(self.kind, (3, 3) if self.kind in EXAMPLES else (1, 1))
         if not (fewest[0] <= self.columns <= 200 and fewest[1] <= self.rows <= 200):
             raise InputError(
                 f"a {self.kind} board of {self.columns}x{self.rows} cannot be used: give"
                 f" {fewest[0]} to 200 columns and {fewest[1]} to 200 rows, as in '{example}'"
             )
-        if not (math.isfinite(self.pitch_mm) and 0.01 <= self.pitch_mm <= 10_000):
-            raise InputError(
-                f"a pitch of {self.pitch_mm:g} mm cannot be used: give 0.01 to 10000 mm, as in"
-                f" '{example}'"
-            )
+        self._check_pitches(example)
         if self.kind == "charuco":
             self._check_markers()
-        elif self.marker_mm or self.dictionary:
+            # the layouts differ with an even number of rows only
+            object.__setattr__(self, "legacy", self.legacy and self.rows % 2 == 0)
+        elif self.marker_mm or self.dictionary or self.legacy:
             raise InputError(f"a {self.kind} board has no markers: omit marker and dictionary")
+
+    def _check_pitches(self, example: str) -> None:
+        """Set the default of the pitch along y, and raise InputError for pitches that no board
+        has."""
+        if not self.pitch_y_mm:
+            object.__setattr__(self, "pitch_y_mm", self.pitch_mm)
+        for pitch in self.pitches.tolist():
+            if not (math.isfinite(pitch) and 0.01 <= pitch <= 10_000):
+                raise InputError(
+                    f"a pitch of {pitch:g} mm cannot be used: give 0.01 to 10000 mm, as in"
+                    f" '{example}'"
+                )
+        if self.pitch_y_mm != self.pitch_mm and self.plugin_type:
+            raise InputError(f"a {self.kind} board comes from a plugin and has one pitch: give one")
+        if not 1 / MAX_STRETCH <= self.pitch_y_mm / self.pitch_mm <= MAX_STRETCH:
+            raise InputError(
+                f"pitches of {self.pitch_mm:g} mm along x and {self.pitch_y_mm:g} mm along y cannot"
+                f" be used: their ratio is at most {MAX_STRETCH:g}, and a board drawn with square"
+                " cells is needed"
+            )
 
     def _check_markers(self) -> None:
         """Set the defaults of marker and dictionary, and raise InputError where they do not fit the
@@ -162,11 +193,12 @@ class Board:
                 f" {', '.join(board_examples())}, for example '{EXAMPLES['circles']}'"
                 + BOARD_PLUGINS.explain_missing(kind)
             )
-        most = 4 if kind == "charuco" else 2
+        is_charuco = kind in ("charuco", LEGACY)
+        most = 4 if is_charuco else 2
         if not 2 <= len(fields) <= most:
             raise InputError(
                 f"board '{notation}' has {len(fields)} fields after the kind: give columns x rows"
-                f" and the {'side of a square' if kind in ('chessboard', 'charuco') else 'pitch'}"
+                f" and the {'side of a square' if is_charuco or kind == 'chessboard' else 'pitch'}"
                 f" in mm, as in '{example}'"
             )
         size = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", fields[0])
@@ -174,13 +206,21 @@ class Board:
             raise InputError(
                 f"board '{notation}': '{fields[0]}' is not columns x rows, as in '{example}'"
             )
-        pitch = _parse_millimetres(notation, fields[1], example)
+        pitch, *along_y = (
+            _parse_millimetres(notation, text, example)
+            for text in re.split("[xX×]", fields[1], maxsplit=1)
+        )
         marker = _parse_millimetres(notation, fields[2], example) if len(fields) > 2 else 0.0
         dictionary = fields[3].strip().upper() if len(fields) > 3 else ""
-        return cls(kind, int(size[1]), int(size[2]), pitch, marker, dictionary)
+        columns, rows, pitch_y = int(size[1]), int(size[2]), along_y[0] if along_y else 0.0
+        return cls(kind, columns, rows, pitch, marker, dictionary, pitch_y)
 
     def __str__(self) -> str:
-        fields = [self.kind, f"{self.columns}x{self.rows}", _format_number(self.pitch_mm)]
+        pitch = _format_number(self.pitch_mm)
+        if self.pitch_y_mm != self.pitch_mm:
+            pitch += f"x{_format_number(self.pitch_y_mm)}"
+        kind = LEGACY if self.legacy else self.kind
+        fields = [kind, f"{self.columns}x{self.rows}", pitch]
         if self.kind == "charuco":
             plain = self.dictionary == DEFAULT_DICTIONARY
             if not plain or self.marker_mm != DEFAULT_MARKER * self.pitch_mm:
@@ -209,7 +249,7 @@ class Board:
         columns, rows = self.features
         i, j = np.divmod(np.arange(columns * rows), columns)
         x = 2 * j + i % 2 if self.kind == "acircles" else j
-        points = np.stack([x, i, np.zeros(len(i))], axis=1) * self.pitch_mm
+        points = np.stack([x, i, np.zeros(len(i))], axis=1) * [*self.pitches, 0.0]
         if added := self.plugin_type:
             points = np.array(added.points(self), np.float64)
             is_flat = points.shape == (columns * rows, 3) and not points[:, 2].any()
@@ -220,6 +260,16 @@ class Board:
                 )
         points.flags.writeable = False
         return points
+
+    @property
+    def pitches(self) -> Floats:
+        """(2,) float64 mm: the pitch along x and along y."""
+        return np.array([self.pitch_mm, self.pitch_y_mm])
+
+    @cached_property
+    def nodes(self) -> Floats:
+        """(n, 2) float64: the points' x and y in pitches."""
+        return self.points[:, :2] / self.pitches
 
     def outline(self, margin_mm: float | None = None) -> Floats:
         """Return a rectangle (4, 3) float64 mm around the features, from top left over top right to

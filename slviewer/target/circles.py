@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from slviewer.errors import DetectionError
+from slviewer.errors import BoardError, DetectionError
 from slviewer.geometry.jit import kernel, read_only, run_rows
 from slviewer.geometry.rigid import Floats, Floats32
 from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.target.blobs import Blobs, detect_blobs
 from slviewer.target.board import Board
-from slviewer.target.images import SEARCH_PX, BoardImage, light_advice, resize_image
+from slviewer.target.images import MIRRORED, SEARCH_PX, BoardImage, light_advice, resize_image
 from slviewer.target.lattice import (
     AREA_RATIO,
     NODE_RADIUS,
@@ -22,7 +22,7 @@ from slviewer.target.lattice import (
     grow_lattices,
     match_pattern,
 )
-from slviewer.target.mark import select_numbering_by_mark
+from slviewer.target.mark import is_mark_mirrored, select_numbering_by_mark
 from slviewer.target.planar import (
     MAX_GRID_OFFSET,
     MAX_GRID_OFFSET_SIGMAS,
@@ -188,7 +188,7 @@ def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage
 def _fit_map(board: Board, blobs: Blobs) -> GridMap | None:
     """Fit the map from board to image; None unless the blobs, in the board's order, form a grid of
     equal circles."""
-    points = board.points[:, :2] / board.pitch_mm
+    points = board.nodes
     try:
         grid_map = fit_grid_map(points, blobs.centres, robust=True)
     except DetectionError:
@@ -206,7 +206,7 @@ def _grid_continues(board: Board, grid_map: GridMap, blobs: Blobs, numbering: np
     A blob counts only if it is as close to its extrapolated position as the grid's own circles are;
     most clutter next to a board is not.
     """
-    points = board.points[:, :2] / board.pitch_mm
+    points = board.nodes
     pitch = np.maximum(grid_map.pitch_px(points), 1e-9)
     size = np.median(np.sqrt(blobs.areas[numbering]) / pitch)
     others = blobs.select(np.delete(np.arange(len(blobs.centres)), numbering))
@@ -257,6 +257,8 @@ def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[Floats, floa
     cannot be measured or fits no grid.
     """
     marked = select_numbering_by_mark(board, image.deep, grid.blobs.centres, grid.numberings)
+    if marked is None and is_mark_mirrored(board, image.deep, grid.blobs.centres, grid.numberings):
+        raise BoardError("axis-reversed", MIRRORED)
     order = select_upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
     blobs = grid.blobs.select(order)
     large = blobs.areas > MIN_SHAPE_AREA_PX

@@ -8,17 +8,19 @@ light moves it; gradient-based refinement (OpenCV's ``cornerSubPix``) is off by 
 the same images.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from scipy.special import erf
 
-from slviewer.errors import DetectionError
+from slviewer.errors import BoardError, DetectionError
 from slviewer.geometry.rigid import Floats, Floats32, Mask
 from slviewer.geometry.vectors import lengths
 from slviewer.target.board import Board
 from slviewer.target.images import (
+    MIRRORED,
     SEARCH_PX,
     BoardImage,
     flatten_light,
@@ -26,12 +28,15 @@ from slviewer.target.images import (
     resize_image,
     to_full_image,
 )
-from slviewer.target.planar import check_grid, fit_homography, jacobians, select_upright
+from slviewer.target.planar import check_grid, fit_homography, jacobians, select_upright, to_image
 
 MIN_CORNERS = 8
 """Smallest number of corners of a pose."""
 SUFFICIENT_SHARE = 0.8
 """Share of the corners at which the search ends; below it continues at higher resolution."""
+MARKER_TOLERANCE = 0.5
+"""Largest distance, in squares, of a marker's corner from its place in a layout."""
+MIN_MARKER_CORNERS = 8
 MIN_CONTRAST = 1.12
 """Bright over dark squares around a corner."""
 MAX_HALF_WIDTH_PX = 11
@@ -49,22 +54,28 @@ CONVERGENCE_PX = 1e-3
 def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
     """Return the board as an OpenCV ``CharucoBoard``."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    return cv2.aruco.CharucoBoard(
+    charuco = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary
     )
+    charuco.setLegacyPattern(board.legacy)
+    return charuco
 
 
 def detect_charuco(board: Board, image: BoardImage) -> tuple[Floats, np.ndarray]:
-    """Detect corners; returns pixels (n, 2) float64 and ids (n,) int. Raises DetectionError for too
-    few corners."""
+    """Detect corners; returns pixels (n, 2) float64 and ids (n,) int.
+
+    Raises DetectionError for too few corners, and BoardError for markers in the other layout and
+    for a mirror image.
+    """
     detector = cv2.aruco.CharucoDetector(opencv_board(board))
     first = min(1.0, SEARCH_PX / max(image.grey.shape))
     pixels, ids = np.empty((0, 2)), np.empty(0, int)
     markers = 0
     for factor in dict.fromkeys((first / 2, first, 1.0)):
         small = resize_image(image.grey, factor)
-        corners, numbers, _, marker_ids = detector.detectBoard(small)
+        corners, numbers, outlines, marker_ids = detector.detectBoard(small)
         markers = max(markers, 0 if marker_ids is None else len(marker_ids))
+        _check_layout(board, outlines, marker_ids)
         if numbers is not None and len(numbers) > len(ids):
             pixels = to_full_image(np.reshape(corners, (-1, 2)), factor)
             ids = np.ravel(numbers).astype(int)
@@ -72,8 +83,14 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[Floats, np.ndarray]
             break
     if len(ids) >= MIN_CORNERS:
         points = board.points[ids][:, :2]
-        pixels, good = refine_corners(image.deep, pixels, points, board.pitch_mm, board.marker_mm)
+        pixels, good = refine_corners(image.deep, pixels, points, board.pitches, board.marker_mm)
         pixels, ids = pixels[good], ids[good]
+    if markers < 2:
+        mirrored = np.ascontiguousarray(resize_image(image.grey, first / 2)[:, ::-1])
+        _, _, outlines, marker_ids = detector.detectBoard(mirrored)
+        layouts = (board, replace(board, legacy=not board.legacy))
+        if max(_count_fitting(each, outlines, marker_ids) for each in layouts) > MIN_MARKER_CORNERS:
+            raise BoardError("axis-reversed", MIRRORED)
     if len(ids) < MIN_CORNERS:
         total_markers = board.columns * board.rows // 2
         raise DetectionError(
@@ -82,6 +99,46 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[Floats, np.ndarray]
         )
     check_grid(board, pixels, ids, "corners")
     return pixels, ids
+
+
+def _check_layout(
+    board: Board, outlines: Sequence[np.ndarray], marker_ids: np.ndarray | None
+) -> None:
+    """Raise BoardError where the markers, with ``outlines`` (4, 2) px each, are placed as in the
+    layout that the board does not have: that before, or that since OpenCV 4.6."""
+    other = replace(board, legacy=not board.legacy)
+    if other == board:  # alike with an odd number of rows
+        return
+    count, count_other = (_count_fitting(each, outlines, marker_ids) for each in (board, other))
+    if count_other >= max(MIN_MARKER_CORNERS, count + 4):  # a marker more
+        raise BoardError(
+            "board-size",
+            f"{count_other} of {4 * len(outlines)} corners of the markers fit {other}, a layout"
+            f" {'before' if other.legacy else 'since'} OpenCV 4.6, and {count} fit {board}: give"
+            f" the board as {other}",
+        )
+
+
+def _count_fitting(
+    board: Board, outlines: Sequence[np.ndarray], marker_ids: np.ndarray | None
+) -> int:
+    """Return how many of the markers' corners, (4, 2) px each, fit their places on the board by one
+    homography."""
+    places = np.array(opencv_board(board).getObjPoints())[..., :2]
+    ids = np.empty(0, int) if marker_ids is None else np.ravel(marker_ids)
+    known = np.flatnonzero(ids < len(places))
+    if len(known) < 2:
+        return 0
+    pixels = np.reshape(outlines, (-1, 4, 2))[known].reshape(-1, 2)
+    points = places[ids[known]].reshape(-1, 2)
+    tolerance = MARKER_TOLERANCE * board.pitch_mm
+    H, _ = cv2.findHomography(pixels, points, cv2.RANSAC, tolerance)
+    if H is None:
+        return 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return int(
+            np.count_nonzero(lengths(to_image(np.asarray(H, float), pixels) - points) < tolerance)
+        )
 
 
 def detect_chessboard(board: Board, image: BoardImage) -> Floats:
@@ -114,7 +171,7 @@ def _verify_grid(board: Board, image: BoardImage, grid: Floats) -> Floats:
     if a * d < b * c:  # v points down
         grid = grid[:, ::-1]
     pixels, good = refine_corners(
-        image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm
+        image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitches
     )
     if not good.all():
         raise DetectionError(
@@ -267,15 +324,15 @@ def refine_corners(
     image: Floats32,
     pixels: Floats,
     points: Floats,
-    pitch: float,
+    pitch: Floats,
     marker: float = 0.0,
 ) -> tuple[Floats, Mask]:
     """Refine corners; returns sub-pixel positions (n, 2) float64 px and whether each fits the
     model, (n,) bool.
 
     ``image`` (h, w) float32; ``pixels`` (n, 2) px: initial positions, good to a px or two;
-    ``points`` (n, 2) mm: the corners on the board; ``pitch`` and ``marker``: sides of the squares
-    and of the markers in them, mm.
+    ``points`` (n, 2) mm: the corners on the board; ``pitch`` (2,) and ``marker``: sides of the
+    squares and of the markers in them, mm.
     """
     H = fit_homography(points, pixels)
     to_px = jacobians(H, points) * pitch
@@ -289,7 +346,7 @@ def refine_corners(
     grey = image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(np.float64)
     offset = np.stack([u, v], axis=2) - pixels[:, None]
     board = np.abs(np.einsum("nij,nmj->nmi", np.linalg.inv(to_px), offset))
-    free = 0.8 * (1 - marker / pitch) / 2 if marker else EDGE_SHARE
+    free = 0.8 * (1 - marker / pitch.min()) / 2 if marker else EDGE_SHARE
     weight = (inside & (board.max(2) < EDGE_SHARE) & (board.min(2) < free)).astype(float)
     shift, misfit = _fit_corners(offset, grey, weight, to_px)
     good = misfit < np.maximum(MAX_MISFIT, MAX_RELATIVE_MISFIT * np.median(misfit))

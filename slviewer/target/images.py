@@ -10,6 +10,11 @@ from slviewer.errors import InputError
 from slviewer.fringe.layout import image_white
 from slviewer.geometry.rigid import Floats, Floats32
 
+MIRRORED = (
+    "the camera's image of the board is a mirror image: switch off the camera's mirror (selfie) or"
+    " flip mode, or mirror its images back, and show the board directly, not in a mirror or from"
+    " behind"
+)
 SEARCH_PX = 1600
 """Longest side of the downscaled image for the first search; features are measured in the full
 image."""

@@ -122,7 +122,7 @@ def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
     Numberings of the same blobs are the board's rotational symmetries; different sets of blobs mean
     that the lattice is larger than the board.
     """
-    pattern = np.rint(board.points[:, :2] / board.pitch_mm).astype(int)
+    pattern = np.rint(board.nodes).astype(int)
     spans = pattern.max(0) + 1
     to_board = DIAGONAL if board.kind == "acircles" else np.eye(2, dtype=int)
     for shear in SHEARS:

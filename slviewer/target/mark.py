@@ -88,6 +88,16 @@ def select_numbering_by_mark(
     return numberings[best] if is_marked else None
 
 
+def is_mark_mirrored(
+    board: Board, image: np.ndarray, centres: Floats, numberings: list[np.ndarray]
+) -> bool:
+    """Whether the mark is where a mirror image of the board has it; arguments as of
+    ``select_numbering_by_mark``."""
+    columns, rows = board.features
+    mirrored = [order.reshape(rows, columns)[::-1].ravel() for order in numberings]
+    return select_numbering_by_mark(board, image, centres, mirrored) is not None
+
+
 def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: Floats) -> tuple[float, bool]:
     """Return the contrast at the mark's position over the first circle's, and whether a dot there
     may be the mark.
@@ -98,9 +108,9 @@ def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: Floats) -> 
     centre = np.array([mark.x, mark.y])
     near = np.argsort(lengths(points - centre))[:PREDICTING_CIRCLES]
     H = fit_homography(points[near], pixels[near])
-    bent = fit_grid_map(points / board.pitch_mm, pixels).to_image(centre[None] / board.pitch_mm)[0]
-    if not np.linalg.det(jacobians(H, centre[None]))[0] > 0:
-        return 0.0, False
+    bent = fit_grid_map(board.nodes, pixels).to_image(centre[None] / board.pitches)[0]
+    if not np.linalg.det(jacobians(H, np.stack([centre, points[0]]))).prod() > 0:
+        return 0.0, False  # behind the camera
     shift = np.eye(3)
     shift[:2, 2] = bent - to_image(H, centre[None])[0]
     dot = _measure_profile(image, shift @ H, centre, mark.radius)

@@ -138,7 +138,7 @@ def check_grid(board: Board, pixels: Floats, ids: np.ndarray, what: str) -> None
     numbering must be right-handed.
     """
     advice = "keep the board flat and in focus, without reflections, and take the pose again"
-    points = board.points[ids][:, :2] / board.pitch_mm
+    points = board.nodes[ids]
     fitted = fit_grid_map(points, pixels)
     areas = np.linalg.det(jacobians(fitted.H, points))
     if areas.max() <= 0:

@@ -151,6 +151,11 @@ def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
         raise InputError(
             f"{board.kind} boards come from a plugin and cannot be drawn: print its maker's file"
         )
+    if board.pitch_y_mm != board.pitch_mm:
+        raise InputError(
+            f"Cannot draw {board}: two pitches describe a print as it was measured. Draw it with"
+            " one pitch."
+        )
     mark = mark_geometry(board)
     radius = CIRCLE_SHARE / 2 * neighbour_distance_mm(board)
     needed_margin = (
@@ -178,10 +183,11 @@ def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
 
 def _add_black_squares(board: Board, drawing: Drawing, x: float, y: float) -> None:
     """Add the black squares of a board whose first inner corner is at (x, y) mm; the top-left one
-    is black."""
+    is black, but for the layout before OpenCV 4.6."""
     p = board.pitch_mm
     columns, rows = board.features
-    for i, j in np.argwhere(np.indices((rows + 1, columns + 1)).sum(axis=0) % 2 == 0).tolist():
+    parity = np.indices((rows + 1, columns + 1)).sum(axis=0) % 2
+    for i, j in np.argwhere(parity == board.legacy).tolist():
         drawing.rectangles.append((x + (j - 1) * p, y + (i - 1) * p, p, p))
     if board.kind != "charuco":
         return

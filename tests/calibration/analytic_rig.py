@@ -20,7 +20,7 @@ def rig() -> StereoRig:
     """A quarter of the Letter's resolution: baseline 180 mm, axes crossing at 600 mm, fy twice fx
     in the projector."""
     camera = Lens(
-        np.array([[890.0, 0, 203.0], [0, 892.0, 147.0], [0, 0, 1]]),
+        np.array([[890.0, 0, 203.0], [0, 890.5, 147.0], [0, 0, 1]]),
         np.array([-0.08, 0.03, 4e-4, -3e-4, 0.0]),
         SIZE,
     )

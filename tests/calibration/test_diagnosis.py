@@ -95,7 +95,9 @@ def test_cells_that_are_not_square_are_named() -> None:
     poses = [dataclasses.replace(o, points=o.points * scaled) for o in observations(8)]
     found = attempt(poses)
     assert found.verdict.causes[0] == "board-size" and found.verdict.level != "good"
-    assert missing_facts(found.verdict.findings[0].sentence, "0.70") == []
+    squareness = found.evidence.solution.squareness
+    assert 0.698 < squareness.explaining < 0.702
+    assert f"{squareness.explaining:.4f}" in found.verdict.findings[0].sentence
     assert "fringe-period" not in found.verdict.causes
 
 

@@ -2,15 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from slviewer.calibration.known_camera import CameraCheck
+from slviewer.calibration.squareness import Squareness
 from slviewer.calibration.stereo import MIN_TILT_SPREAD_DEG
 from slviewer.fringe.sequence import Axis
 from slviewer.records.plain import from_plain
-from slviewer.records.verdict import Finding
+from slviewer.records.verdict import Cause, Finding
 
 MIN_DEPTH_SHARE = 3e-5
 """Depth errors of a smaller share of the depth do not matter: 18 um at 600 mm, half the Letter
@@ -67,12 +68,14 @@ class AxisEvidence:
 class PoseEvidence:
     """Evidence of one capture of the target.
 
-    ``refused``: why its board or phase could not be read, "" where they could. ``grid``: columns
+    ``refused``: why its board or phase could not be read, "" where they could; ``cause``: of the
+    finding where the board contradicts its description or is mirrored. ``grid``: columns
     and rows of the grid of circles detected where the given board does not fit it. ``findings``:
     of the examination of its frames. ``displaced``: number of frames by which the white frame is
     late (positive) or early. ``moved_px``: motion of the features in the camera between the frames
     of the two axes. ``numbering``: how the features are misnumbered, "" where they are not.
     ``turn`` (2, 2): mean Jacobian of the projector coordinates by camera pixels over the board.
+    ``upright``: whether the board's mark or markers show that the camera's image is not mirrored.
     """
 
     name: str
@@ -84,6 +87,8 @@ class PoseEvidence:
     moved_px: float = np.nan
     numbering: str = ""
     turn: tuple[tuple[float, float], tuple[float, float]] | None = None
+    cause: Cause | Literal[""] = ""
+    upright: bool = False
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "PoseEvidence":
@@ -113,8 +118,9 @@ class SolutionEvidence:
     ``median_pose_rms_px``: median over the poses of (camera, projector) reprojection RMS.
     ``focal_sigma``: relative standard deviation of the focal length by device; ``tilt_spread_deg``:
     the largest angle between two boards; ``empty_corners``: corners of the image that the projector
-    illuminates and no pose covers; ``aspects``: fy / fx of camera and projector. ``ripple``:
-    residuals that repeat with the fringe, by axis.
+    illuminates and no pose covers; ``aspects``: fy / fx of camera and projector; ``squareness``:
+    of the camera's pixels and the board's cells. ``ripple``: residuals that repeat with the fringe,
+    by axis.
     """
 
     used: tuple[str, ...]
@@ -126,6 +132,7 @@ class SolutionEvidence:
     empty_corners: tuple[str, ...]
     aspects: tuple[float, float]
     ripple: Mapping[Axis, Ripple] = field(default_factory=dict)
+    squareness: Squareness | None = None
 
 
 @dataclass(frozen=True)

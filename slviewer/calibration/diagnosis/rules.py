@@ -17,7 +17,9 @@ from slviewer.calibration.diagnosis.frames import gamma_from_harmonic
 from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY, CameraCheck, judge_camera
 from slviewer.calibration.observe import AXES
 from slviewer.calibration.splined.residual_noise import Noise
+from slviewer.calibration.squareness import judge_squareness, nearest_aspect
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, MIN_TILT_SPREAD_DEG
+from slviewer.examination.findings import mirroring_remedy
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import unit_vectors
@@ -38,8 +40,6 @@ REJECTED_SATURATED = 0.3
 MAX_GAMMA = 1.5
 MAX_PERIOD_ERROR = 0.04
 PERIOD_SIGMAS = 4.0
-ASPECTS = (0.5, 1.0, 2.0)
-"""Of square pixels, and of the diamond pixels of some DMDs."""
 MAX_ASPECT_ERROR = 0.05
 _CAUSES_IN_POSES = ("axes-swapped", "axis-reversed", "saturation")
 _SYMPTOMS = ("projector-size", "fringe-period", "unreadable")
@@ -187,16 +187,16 @@ def diagnose_saturation(e: Evidence) -> Iterator[Finding]:
 
 
 def diagnose_mirroring(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where the axes are exchanged or one is reversed: the projector's image is a
-    mirror image.
-
-    Both devices are assumed to be upright.
-    """
+    """Yield a finding where the axes are exchanged or one is reversed: one device's image is a
+    mirror image, the projector's where the board shows that the camera's is not."""
     # of projector by camera pixels
     jacobians = {pose.name: np.array(pose.turn) for pose in list_ordered_poses(e) if pose.turn}
     mirrored = {name: J for name, J in jacobians.items() if np.linalg.det(J) < 0}
     if len(mirrored) <= COMMON_SHARE * len(jacobians):
         return
+    upright = [pose.upright for pose in e.poses if pose.name in mirrored]
+    is_upright = sum(upright) > COMMON_SHARE * len(upright)
+    shown = "the camera sees, and the board shows unmirrored" if is_upright else "the camera sees"
     mean = unit_vectors(np.array([*mirrored.values()])).mean(axis=0)
     cause: Cause = "axis-reversed"
     if abs(np.diag(mean[::-1])).sum() > abs(np.diag(mean)).sum():
@@ -212,12 +212,16 @@ def diagnose_mirroring(e: Evidence) -> Iterator[Finding]:
             else ("y", "top and bottom", "flip", "rows")
         )
         as_if = f"its {axis} axis were reversed ({across})"
-        remedy = f"switch off the projector's {mode} mode, or number its {lines} from the other end"
+        remedy = f"switch off the projector's {mode} mode"
+        if is_upright:
+            remedy += f", or number its {lines} from the other end"
+    if not is_upright:
+        remedy = mirroring_remedy(remedy)
     yield Finding(
         cause,
         "rejected",
         f"in {len(mirrored)} of {len(jacobians)} poses the projector's coordinates are a mirror"
-        f" image of what the camera sees, as if {as_if}",
+        f" image of what {shown}, as if {as_if}",
         remedy,
         tuple(mirrored),
     )
@@ -247,9 +251,11 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
             " the phase at the Gray code's edges",
             "correct period_px in the description, or project the patterns without scaling",
         )
-    elif e.solution is not None and not (e.tilts_undetermined or any(_diagnose_cells(e))):
-        aspect = e.solution.aspects[1]
-        if abs(aspect / _nearest_aspect(aspect) - 1) > MAX_ASPECT_ERROR:
+    elif e.solution is not None and not e.tilts_undetermined:
+        camera, aspect = e.solution.aspects
+        # or of a stretched board, which both devices see
+        errors = [each / nearest_aspect(each) - 1 for each in (aspect, aspect / camera)]
+        if min(map(abs, errors)) > MAX_ASPECT_ERROR:
             yield Finding(
                 "fringe-period",
                 "doubtful",
@@ -258,11 +264,6 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
                 "compare the fringe period of each axis with its description, and turn off the"
                 " projector's scaling",
             )
-
-
-def _nearest_aspect(aspect: float) -> float:
-    """Return the aspect of a projector's pixels that is nearest to the measured one."""
-    return min(ASPECTS, key=lambda each: abs(np.log(aspect / each)))
 
 
 def _describe_wrong_period(e: Evidence, axis: Axis) -> str:
@@ -309,27 +310,24 @@ def diagnose_description(e: Evidence) -> Iterator[Finding]:
         )
 
 
-def _diagnose_cells(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where camera and projector share an aspect that is not of their pixels."""
-    if e.solution is None or e.tilts_undetermined:
-        return
-    camera, projector = e.solution.aspects
-    projector /= _nearest_aspect(projector / camera)
-    if min(abs(camera - 1), abs(projector - 1)) > MAX_ASPECT_ERROR > abs(projector / camera - 1):
-        yield Finding(
-            "board-size",
-            "doubtful",
-            "camera and projector alike appear to have pixels of another aspect: seen upright, the"
-            f" board's cells are {np.sqrt(camera * projector):.2f} times as high as wide",
-            "measure the board's pitch along both directions, and use a board whose cells are"
-            " square",
-        )
+def diagnose_refused_boards(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding where most poses show a board that contradicts its description, or its mirror
+    image."""
+    causes = Counter(pose.cause for pose in e.poses if pose.cause)
+    for cause, count in causes.items():
+        if count <= COMMON_SHARE * len(e.poses):
+            continue
+        poses = [pose for pose in e.poses if pose.cause == cause]
+        names = tuple(pose.name for pose in poses)
+        sentence, _, remedy = poses[0].refused.partition(": ")
+        yield Finding(cause, "rejected", f"{format_poses(e, names)} {sentence}", remedy, names)
 
 
 def diagnose_board_size(e: Evidence) -> Iterator[Finding]:
     """Yield a finding where the board's cells are not square, and where most poses show a board of
     other columns and rows than those given."""
-    yield from _diagnose_cells(e)
+    if e.solution and e.solution.squareness and not e.tilts_undetermined:
+        yield from judge_squareness(e.board, e.solution.squareness, e.solution.aspects[1])
     kind, _, rest = e.board.partition(":")
     grids = Counter(pose.grid for pose in e.poses if pose.grid is not None and pose.refused)
     if kind != "circles" or not grids:
@@ -538,7 +536,13 @@ def diagnose_solution(e: Evidence) -> Iterator[Finding]:
 
 STAGES: tuple[tuple[Callable[[Evidence], Iterator[Finding]], ...], ...] = (
     (diagnose_frame_order, diagnose_saturation),
-    (diagnose_mirroring, diagnose_period, diagnose_description, diagnose_board_size),
+    (
+        diagnose_refused_boards,
+        diagnose_mirroring,
+        diagnose_period,
+        diagnose_description,
+        diagnose_board_size,
+    ),
     (
         lambda e: judge_camera(e.camera),
         diagnose_single_poses,

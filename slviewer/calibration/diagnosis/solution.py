@@ -14,6 +14,7 @@ import numpy as np
 from slviewer.calibration.board_pose import intersect_board, solve_pose
 from slviewer.calibration.diagnosis.evidence import ExcludedPose, Ripple, SolutionEvidence
 from slviewer.calibration.observe import AXES, Observation, Samples
+from slviewer.calibration.squareness import Squareness, measure_squareness
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import fit_polynomial, fit_slopes, grid_points
@@ -63,7 +64,18 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
         empty_corners=list_empty_corners(used, stereo),
         aspects=(float(focal[0][1] / focal[0][0]), float(focal[1][1] / focal[1][0])),
         ripple=measure_ripple(used, stereo),
+        squareness=_measure_squareness(used, stereo),
     )
+
+
+def _measure_squareness(used: Sequence[Observation], stereo: StereoModel) -> Squareness:
+    """Measure the squareness of the camera's pixels and the board's cells from the features that
+    the calibration used."""
+    pixels = [
+        np.where(finite_rows(stereo.residuals_px[o.name])[:, None], o.camera, np.nan) for o in used
+    ]
+    poses, points = [stereo.poses[o.name] for o in used], [o.points for o in used]
+    return measure_squareness(stereo.rig.camera, poses, points, pixels)
 
 
 def measure_excluded(observation: Observation, stereo: StereoModel) -> ExcludedPose:

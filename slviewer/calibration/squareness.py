@@ -1,0 +1,209 @@
+"""Whether a camera's pixels and a board's cells are square.
+
+A print that is stretched in one direction gives a camera focal lengths that differ in x and y, as
+pixels that are not square do; nearly all cameras have square ones. Only tilts of the board tell the
+two apart, or the projector, which sees the same print.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy import stats
+
+from slviewer.calibration.board_pose import solve_device
+from slviewer.errors import InputError
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import finite_rows
+from slviewer.records.verdict import Finding
+from slviewer.target.board import Board
+
+MIN_ASPECT_ERROR = 1.5e-3
+"""Aspects and shears below it may come from local lens distortion (6e-4 on simulated rigs with 0.15
+px of it, and as much with a board bent by 0.3 mm)."""
+DOUBT = 1e-4
+"""Probability that an estimate differs from its true value by more than its limit."""
+ASPECTS = (0.5, 1.0, 2.0)
+"""Of square pixels, and of the diamond pixels of some DMDs."""
+MIN_SHARED = 0.25
+"""The projector shares the camera's aspect, or not, where its own agrees to this share of it."""
+
+
+@dataclass(frozen=True)
+class Squareness:
+    """Whether a camera's pixels, and a board's cells, are square; each with the limit that its
+    error exceeds with a probability of `DOUBT`, estimated from the differences between the poses.
+
+    ``aspect``: fy / fx, where the board is as described; ``shear``: of its x by its y. ``stretch``:
+    of its y over its x, where the pixels' aspect is free: what the tilts of the poses alone show.
+    ``explaining``: the stretch with which the pixels are square, tried; NaN where not estimated.
+    """
+
+    aspect: float
+    aspect_limit: float
+    shear: float = 0.0
+    shear_limit: float = np.inf
+    stretch: float = 1.0
+    stretch_limit: float = np.inf
+    explaining: float = np.nan
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the pixels appear other than square, by more than lenses and boards disturb."""
+        return abs(self.aspect - 1) > max(MIN_ASPECT_ERROR, self.aspect_limit)
+
+    @property
+    def is_sheared(self) -> bool:
+        """Whether the board's rows and columns are not at right angles."""
+        return abs(self.shear) > max(MIN_ASPECT_ERROR, self.shear_limit)
+
+
+def measure_squareness(
+    lens: Lens, poses: Sequence[Floats], points: Sequence[Floats], pixels: Sequence[Floats]
+) -> Squareness:
+    """Measure the aspect of a camera's pixels and a board's stretch and shear.
+
+    ``lens`` and ``poses``, T_camera_board (4, 4) mm: a solution from ``points`` (n, 3) mm and
+    ``pixels`` (n, 2) of each pose, NaN where excluded. Takes one Gauss-Newton step from it; limits
+    are the jackknife's over the poses.
+    """
+    K, D, systems = lens.K, lens.D, []
+    for T, X, measured in zip(poses, points, pixels, strict=True):
+        used = finite_rows(measured)
+        X = X[used]
+        rvec, _ = cv2.Rodrigues(T[:3, :3])
+        projected, J = cv2.projectPoints(X, rvec, T[:3, 3], K, D)
+        residual = (measured[used] - projected[:, 0]).ravel()
+        on_board = J[:, 3:6].reshape(-1, 2, 3) @ T[:3, :3]  # by the features' positions, mm
+        shear, stretch = (on_board[..., k] * X[:, 1, None] for k in (0, 1))
+        aspect = K[1, 1] * J[:, 7]
+        focal = K[0, 0] * J[:, 6] + aspect
+        shared = np.column_stack([focal, J[:, 8:15], aspect, shear.ravel(), stretch.ravel()])
+        Q, _ = np.linalg.qr(J[:, :6])  # what a move of the board does not explain
+        systems.append((shared - Q @ (Q.T @ shared), residual - Q @ (Q.T @ residual)))
+    described, described_limits = _fit_jackknife([(J[:, :-1], r) for J, r in systems])
+    free, free_limits = _fit_jackknife(systems)
+    squareness = Squareness(
+        float(K[1, 1] / K[0, 0] * np.exp(described[8])),
+        float(described_limits[8]),
+        float(described[9]),
+        float(described_limits[9]),
+        float(1 + free[10]),
+        float(free_limits[10]),
+    )
+    if not squareness.is_doubtful:
+        return squareness
+    return replace(squareness, explaining=_explain_aspect(points, pixels, lens.size))
+
+
+def _fit_jackknife(systems: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Solve the poses' equations (J (m, k), r (m,)) together; return the solution (k,) and the
+    limits of its errors, inf where a pose alone determines it."""
+    normal = [J.T @ J for J, _ in systems]
+    total = np.sum(normal, axis=0)
+    try:
+        x = np.linalg.solve(total, np.sum([J.T @ r for J, r in systems], axis=0))
+        changes = [
+            np.linalg.solve(total - N, J.T @ (r - J @ x))
+            for N, (J, r) in zip(normal, systems, strict=True)
+        ]
+    except np.linalg.LinAlgError:
+        return np.zeros(len(total)), np.full(len(total), np.inf)
+    count = len(systems)
+    sigma = np.sqrt((count - 1) / count * np.sum(np.square(changes), axis=0))
+    return x, stats.t.isf(DOUBT / 2, count - 1) * sigma
+
+
+def _explain_aspect(
+    points: Sequence[Floats], pixels: Sequence[Floats], size: tuple[int, int]
+) -> float:
+    """Return the stretch of the board's y over its x with which the camera, solved again, has
+    square pixels."""
+    used = [finite_rows(each) for each in pixels]
+    images = [each[rows] for each, rows in zip(pixels, used, strict=True)]
+    stretch = 1.0
+    for _ in range(3):
+        scaled = [X[rows] * [1.0, stretch, 1.0] for X, rows in zip(points, used, strict=True)]
+        K, _, _, _ = solve_device("camera", scaled, images, size)
+        stretch *= float(K[1, 1] / K[0, 0])
+    return stretch
+
+
+def nearest_aspect(aspect: float) -> float:
+    """Return the aspect of a projector's pixels that is nearest to the measured one."""
+    return min(ASPECTS, key=lambda each: abs(np.log(aspect / each)))
+
+
+def judge_squareness(
+    notation: str, squareness: Squareness, projector_aspect: float = np.nan
+) -> Iterator[Finding]:
+    """Yield findings where the camera's pixels, and the board's cells, are not square.
+
+    ``notation``: of the board; ``projector_aspect``: fy / fx of the projector, if there is one.
+    """
+    s = squareness
+    if s.is_doubtful:
+        yield Finding(
+            "board-size",
+            "doubtful",
+            f"the camera's pixels appear {s.aspect:.4f} (+- {s.aspect_limit:.4f}) times as wide as"
+            " high, and those of hardly any sensor are: either the board's print is"
+            f" {s.explaining:.4f} times as long along y, for its length along x, as its notation"
+            " says, or the sensor's pixels are not square, or its images were scaled"
+            + _compare_stretches(s, projector_aspect),
+            _advise_pitches(Board.parse(notation), s.explaining),
+        )
+    if s.is_sheared:
+        angle, limit = (float(np.degrees(each)) for each in (s.shear, s.shear_limit))
+        yield Finding(
+            "board-size",
+            "doubtful",
+            f"the board's rows and columns are at {90 - angle:.2f} (+- {limit:.2f}) degrees",
+            "measure both diagonals of the print, which are equal where it is right, and print the"
+            " board anew, with another printer, or use a plate",
+        )
+
+
+def _compare_stretches(s: Squareness, projector_aspect: float) -> str:
+    """Return which of print and sensor the poses' tilts or the projector support, "" where
+    neither does."""
+    off_right, off_print = abs(s.stretch - 1), abs(s.stretch - s.explaining)
+    near, far = sorted([off_right, off_print])
+    if far > s.stretch_limit > near:
+        text = f"the poses' tilts alone, {s.stretch:.4f} (+- {s.stretch_limit:.4f}) times,"
+        is_print = off_print < off_right
+    else:
+        change = np.log(projector_aspect / nearest_aspect(projector_aspect / s.aspect))
+        share = change / np.log(s.aspect)
+        if not (abs(share) < MIN_SHARED or abs(share - 1) < MIN_SHARED):
+            return ""
+        is_print = abs(share - 1) < MIN_SHARED
+        text = f"the projector, whose aspect of {projector_aspect:.4f} "
+        text += "shares the factor," if is_print else "does not,"
+    return f" ({text} support{'s' * ('tilts' not in text)} the {'print' if is_print else 'sensor'})"
+
+
+def _advise_pitches(board: Board, stretch: float) -> str:
+    """Return the remedy for a board whose print is stretched along y, for its length along x, by a
+    factor."""
+    columns, rows = np.ptp(board.nodes, axis=0).tolist()
+    x, y = board.pitches.tolist()
+    cases = []
+    for pitches in ((x / stretch, y), (x, y * stretch)):
+        try:
+            each = replace(
+                board, pitch_mm=float(f"{pitches[0]:.5g}"), pitch_y_mm=float(f"{pitches[1]:.5g}")
+            )
+        except InputError:
+            return "measure the board's pitch along both directions, and use one with square cells"
+        cases.append(
+            f"for {columns * pitches[0]:.2f} mm along x and {rows * pitches[1]:.2f} mm along y give"
+            f" the board as {each}"
+        )
+    return (
+        f"measure the print along both directions, over {columns:g} pitches along x and {rows:g}"
+        f" along y: {', '.join(cases)}, for {columns * x:.2f} mm and {rows * y:.2f} mm the print is"
+        " right, and so is this calibration; for other lengths, give the pitches they make"
+    )
