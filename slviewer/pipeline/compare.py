@@ -17,11 +17,11 @@ from slviewer.inspection.deviation import (
     judge_deviation,
 )
 from slviewer.pipeline.feedback import part, stage
-from slviewer.pipeline.measure import (
+from slviewer.pipeline.measure import provenance
+from slviewer.pipeline.measured_surface import (
     LoadSurface,
     MeasuredSurface,
     load_surface,
-    provenance,
     triangulate_surface,
 )
 from slviewer.pipeline.models import ModelName

@@ -314,8 +314,7 @@ def _list_warnings(
         if each.rival_mm is not None:
             yield rests_on_start(a, b, each.start, each.rival_mm)
     yield from registered.alignment.dropped.values()
-    still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
-    if still:
+    if still := {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}:
         total = sum(int(clouds[name].mask.sum()) for name in still)
         counts = ", ".join(f"{count} of {name}" for name, count in still.items())
         where = "in the merge once for each scan" if keep_background else "not part of the merge"
@@ -539,9 +538,8 @@ def remove_placement(store: Session, name: str) -> None:
 
 
 def list_placements(store: Session) -> dict[str, Placement | None]:
-    """The placement of every scan of an object (no planes and spheres), in the order in which they
-    were captured; None where it has none, or one that a newer calibration or capture has
-    outdated."""
+    """The placement of every scan of an object (no planes and spheres), in the order of capture;
+    None where it has none, or one that a newer calibration or capture has outdated."""
     captures = sorted(store.captures("scan"), key=lambda each: str(each.meta.get("created", "")))
     return {
         each.name: store.decode_fresh(
@@ -564,14 +562,13 @@ def load_placements(store: Session) -> dict[str, Placement]:
 def view_places(
     placed: Mapping[str, Placement], clouds: dict[str, Cloud], store: Session
 ) -> AlignedScans:
-    """Scans in their places, thinned, with the number of scans that have a point near each point;
-    ``clouds``: those that were loaded before."""
+    """Scans in their places, thinned; ``clouds``: those that were loaded before."""
     trees, facing = [], [np.zeros(0)]
     for name, each in placed.items():
         cloud = _load_cloud(store, name, clouds, ignore_warnings)
-        points, directions = cloud.measured, choose_pixels(cloud_normals(cloud), cloud.mask)
-        step = max(1, len(points) // _SHOWN_POINTS)
-        points, directions = points[::step], directions[::step]
+        step = max(1, np.count_nonzero(cloud.mask) // _SHOWN_POINTS)
+        points = cloud.measured[::step]
+        directions = choose_pixels(cloud_normals(cloud), cloud.mask)[::step]
         trees.append(cKDTree(move_points(np.array(each.T_first_scan), points)))
         facing.append(-np.sum(points * directions, axis=1) / np.linalg.norm(points, axis=1))
     spacing = [np.median(tree.query(tree.data[::20], k=2)[0][:, 1]) for tree in trees]
@@ -593,12 +590,11 @@ def view_places(
 
 
 def _load_cloud(store: Session, name: str, clouds: dict[str, Cloud], warn: Warn) -> Cloud:
-    """The cloud of a scan, of at most `_PIXELS` pixels: the saved one where it is fresh, else
-    reconstructed."""
+    """The cloud of a scan, of at most `_PIXELS` pixels, reconstructed where none is fresh."""
     if name not in clouds:
         cloud = scan_cloud(Job(store, warn=warn), name)
         step = max(1, int(np.ceil(np.sqrt(cloud.sigma_z.size / _PIXELS))))
-        points, sigma_z = cloud.points[::step, ::step], cloud.sigma_z[::step, ::step]
+        points, sigma_z = (each[::step, ::step] for each in (cloud.points, cloud.sigma_z))
         facing = None if cloud.normals is None else cloud.normals[::step, ::step]
         clouds[name] = Cloud(points, cloud.axis, cloud.model, sigma_z, normals=facing)
     return clouds[name]

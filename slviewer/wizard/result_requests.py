@@ -20,10 +20,7 @@ from slviewer.pipeline.export import What, check_export, default_file_name, expo
 from slviewer.pipeline.feedback import part
 from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
 from slviewer.pipeline.measure import (
-    MERGED,
-    MeasuredSurface,
     MeasureSettings,
-    Place,
     RelateSettings,
     export_measurements,
     measure,
@@ -32,9 +29,8 @@ from slviewer.pipeline.measure import (
     restore_measurement,
     trash_measurement,
 )
-from slviewer.pipeline.measure import (
-    What as Tool,
-)
+from slviewer.pipeline.measure import What as Tool
+from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.pipeline.merge import (
     PLACEMENTS,
     AlignSettings,

@@ -16,7 +16,7 @@ from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measure import (
+from slviewer.pipeline.measured_surface import (
     MERGED,
     MeasuredSurface,
     Place,

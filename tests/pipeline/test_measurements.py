@@ -22,7 +22,6 @@ from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measure import (
-    MeasuredSurface,
     describe_measurement,
     export_measurements,
     format_measurements,
@@ -32,6 +31,7 @@ from slviewer.pipeline.measure import (
     section_lines,
     trash_measurement,
 )
+from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.stored_records import Stored, list_records, load_stored, opened, save_record
