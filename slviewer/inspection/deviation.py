@@ -128,9 +128,8 @@ def deviation(
     sigma_mm: float | None = None,
     reach_mm: float | None = None,
     initial: Floats | None = None,
-    views: Sequence[Floats] = (),
+    views: Sequence[Floats] | None = (),
     progress: Progress | None = None,
-    has_camera: bool = True,
 ) -> Deviation:
     """Align scan points (n, 3) mm with a nominal model, and return the signed distance of each.
 
@@ -139,8 +138,8 @@ def deviation(
     ``reach_mm``: points farther off the nominal belong to something else; by default 2 % of its
     diagonal, never below ten times the noise. ``initial`` (4, 4) scan to nominal: replaces the
     search. ``views``: of each view the centres (k, 3) mm of its devices, in the scan's frame, which
-    all have to see a place; all places are visible without. ``has_camera``: whether the scan was
-    seen from its origin. Raises SlviewerError where the two cannot be aligned with trust.
+    all have to see a place; all places are visible without, and None is for a scan that no camera
+    at its origin saw. Raises SlviewerError where the two cannot be aligned with trust.
     """
     report = progress or (lambda share: None)
     points = np.asarray(points, np.float64)
@@ -156,6 +155,7 @@ def deviation(
     report(0.0)
     T = initial
     if T is None:
+        has_camera = views is not None
         T = search_pose(
             points, normals, surface, sigma_mm, lambda share: report(0.6 * share), has_camera
         )
@@ -178,7 +178,7 @@ def deviation(
         )
     report(0.95)
     feet = move_points(T, points[counted]) - signed[counted, None] * towards[counted]
-    area = _measure_area(feet, surface, [move_points(T, centres) for centres in views])
+    area = _measure_area(feet, surface, [move_points(T, centres) for centres in views or ()])
     report(1.0)
     return Deviation(
         signed.astype(np.float32),

@@ -177,9 +177,8 @@ def fit_to_nominal(
         normals=None if normals is None else normals[measured].astype(np.float64),
         sigma_mm=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None,
         reach_mm=reach_mm,
-        views=surface.views,
+        views=surface.views if surface.model else None,
         progress=progress,
-        has_camera=bool(surface.model),
     )
 
 

@@ -117,7 +117,7 @@ def register_object(
         return ObjectAlignment(alignment, clouds, none, {})
     all_samples = _sample_clouds(clouds)
     alignment, static = _register_once(clouds, all_samples, reference, starts, progress)
-    first = {pair[::turn]: r for pair, r in alignment.pairs.items() for turn in (-1, 1)}
+    first = alignment
     moving, samples = clouds, all_samples
     for _ in range(ROUNDS):
         if not static:
@@ -129,13 +129,7 @@ def register_object(
         if refined is None:
             moving, samples, static = clouds, all_samples, {}
             break
-        pairs = {
-            pair: replace(r, start=first[pair].start, rival_mm=first[pair].rival_mm)
-            if pair in first
-            else r
-            for pair, r in refined.pairs.items()
-        }
-        alignment = replace(refined, pairs=pairs)
+        alignment = _keep_starts(refined, first)
         moving, samples = candidate, _sample_clouds(candidate)
         now = detect_static_points(clouds, all_samples, alignment)
         if all(
@@ -154,6 +148,19 @@ def register_object(
     progress(1.0)
     static = static or {name: np.zeros_like(cloud.mask) for name, cloud in clouds.items()}
     return ObjectAlignment(alignment, moving, static, contradictions)
+
+
+def _keep_starts(alignment: MultiwayAlignment, first: MultiwayAlignment) -> MultiwayAlignment:
+    """Return the alignment with the starts of the ``first`` one, which it was refined from, and
+    their rivals."""
+    known = {pair[::turn]: r for pair, r in first.pairs.items() for turn in (-1, 1)}
+    pairs = {
+        pair: replace(r, start=known[pair].start, rival_mm=known[pair].rival_mm)
+        if pair in known
+        else r
+        for pair, r in alignment.pairs.items()
+    }
+    return replace(alignment, pairs=pairs)
 
 
 def _register_once(

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from slviewer.errors import InputError, SessionError
 from slviewer.geometry.vectors import lengths
 from slviewer.session import cad
-from slviewer.session.polygons import Polygons, read_polygons, to_polygons, triangulate
+from slviewer.session.polygons import Polygons, read_polygons, to_polygons, triangulate_polygons
 from slviewer.session.reading import expand_user, read_input
 from slviewer.surface.shapes import Mesh
 
@@ -83,7 +83,7 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     else:
         polygons = read_polygons(path.name, data, notes)
     polygons = _merge_vertices(path.name, polygons, MM[units or "mm"])
-    faces = triangulate(polygons, notes)
+    faces = triangulate_polygons(polygons, notes)
     mesh, closed = _repair(path.name, polygons.vertices, faces, notes)
     digest = hashlib.blake2b(data, digest_size=20).hexdigest()
     return Nominal(mesh, path.name, digest, units, closed, tuple(notes))

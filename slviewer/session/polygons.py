@@ -68,7 +68,7 @@ def to_polygons(vertices: np.ndarray, faces: np.ndarray) -> Polygons:
     return Polygons(vertices.astype(np.float64), corners, np.full(len(corners) // 3, 3))
 
 
-def triangulate(polygons: Polygons, notes: list[str]) -> np.ndarray:
+def triangulate_polygons(polygons: Polygons, notes: list[str]) -> np.ndarray:
     """Return the triangles (m, 3) of polygons in mm, which turn as the polygons do; concave ones
     are cut by clipping ears. Polygons that are not flat, or cross themselves, are named in
     ``notes``. Raises SessionError for many that cross themselves.

@@ -22,7 +22,7 @@ CASES: Mapping[str, Case] = {name: case for field in FIELDS for name, case in fi
 """Of each report and variant, what rebuilds and judges it."""
 
 
-def run_case(name: str, shared: Path) -> Outcome:
+def rebuild_report(name: str, shared: Path) -> Outcome:
     """Rebuild one report in a folder of its own below ``shared``, where cases keep what they
     share."""
     with TemporaryDirectory(dir=shared) as folder:
@@ -34,7 +34,7 @@ def prove_reports(scale: float, seed: int, progress: Progress) -> Proof:
     outcomes: dict[str, Outcome] = {}
     with TemporaryDirectory() as shared:
         for name, _, _ in track(progress, CASES):
-            outcomes[name] = run_case(name, Path(shared))
+            outcomes[name] = rebuild_report(name, Path(shared))
     rows = [
         {"report": name, "measured": it.measured, "truth": it.truth, "": "" if it.holds else "FAIL"}
         for name, it in outcomes.items()

@@ -9,7 +9,7 @@ from facts import missing_facts, raises
 
 from slviewer.errors import SessionError
 from slviewer.session.nominal import read_nominal
-from slviewer.session.polygons import Polygons, triangulate
+from slviewer.session.polygons import Polygons, triangulate_polygons
 from slviewer.validation.reports.case import Workplace
 from slviewer.validation.reports.models import CASES
 
@@ -46,7 +46,7 @@ def test_polygons_that_are_not_flat_or_cross_themselves_are_named() -> None:
     crossing = [(0, 0, 0), (9, 9, 0), (9, 0, 0), (0, 5, 0)]
     notes: list[str] = []
     vertices = np.array(skew + crossing)
-    triangulate(Polygons(vertices, np.arange(8), np.array([4, 4])), notes)
+    triangulate_polygons(Polygons(vertices, np.arange(8), np.array([4, 4])), notes)
     assert missing_facts(" ".join(notes), "1 of 2", "not flat", "0.3 mm", "cross") == []
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from slviewer.validation.prove_reports import CASES, run_case
+from slviewer.validation.prove_reports import CASES, rebuild_report
 
 
 @pytest.fixture(scope="module")
@@ -15,5 +15,5 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_report_gives_the_right_value_or_a_remedy_that_does(name: str, shared: Path) -> None:
-    outcome = run_case(name, shared)
+    outcome = rebuild_report(name, shared)
     assert outcome.holds, f"measured {outcome.measured}, true {outcome.truth}"
