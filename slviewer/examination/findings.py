@@ -99,9 +99,9 @@ def _try_changes(
         if (m := evaluator.match(described(sequence), axis)) is not None:
             misfits[value] = float(m.misfit.mean())
     own = evaluator.match(hypothesis, axis)
-    best = min(misfits, key=lambda value: misfits[value] * (1 + JOINT * (AND in value)), default="")
-    if own is None or not best:
+    if own is None or not misfits:
         return ""
+    best = min(misfits, key=lambda value: misfits[value] * (1 + JOINT * (AND in value)))
     is_as_good = misfits[best] <= limits.AS_LITTLE * float(own.misfit.mean()) + limits.SMALL_LOSS
     return text.format(best) if is_as_good else ""
 
