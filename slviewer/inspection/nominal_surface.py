@@ -37,6 +37,9 @@ from slviewer.surface.shapes import Mesh, count_edges, label_connected
 
 RIM = 0.5
 """Cosine: what the rim of an open surface faces less than this lies beyond it, not above it."""
+SETTLING = 8
+"""Places on either side that a pose is tried at along a motion that normals leave free; then as
+many between two of them."""
 CORNER = 1e-4
 """Barycentric: nearer to a side than this, the nearest place lies on it."""
 NEGLIGIBLE = 1e-4
@@ -294,7 +297,7 @@ def search_pose(
             " of its poses.",
         )
     _refuse_if_doubtful(best)
-    shape = _find_freedom(few, few_normals, surface, best, MOST_SLACK * scan.size)
+    T, shape = _settle(few, few_normals, surface, best, MOST_SLACK * scan.size)
     if shape is not None:
         raise Refused(
             shape,
@@ -302,7 +305,7 @@ def search_pose(
             f" {WORDS[shape]}, so that nothing holds the pose: scan edges, corners or bumps of the"
             " part too, or merge scans of several sides.",
         )
-    return best.T
+    return T
 
 
 def _list_sides(
@@ -361,15 +364,13 @@ def _cap(off: Floats) -> Floats:
     return np.fmin(off**2, 1.0)
 
 
-def _find_freedom(
+def _settle(
     points: Floats, normals: Floats | None, surface: NominalSurface, pose: NominalPose, most: float
-) -> Shape | None:
-    """Classify the shape by the motions of a scan that leave it on the nominal for more than
-    ``most`` mm at its rim; None where it has none.
-
-    Beside the normals of what the scan shows its edges hold it: moved, points lie beyond the
-    surface.
-    """
+) -> tuple[Floats, Shape | None]:
+    """Return the pose (4, 4) moved to where edges hold it, along the motions that the normals of
+    what the scan shows leave free: moved on, points lie beyond the surface. Second, the shape by
+    the motions that leave the scan on the nominal for more than ``most`` mm at its rim all the
+    same; None where it has none."""
     reach = REACH * surface.diagonal
 
     def mean_square(T: Floats) -> float:
@@ -383,14 +384,17 @@ def _find_freedom(
     J = J / np.repeat([radius, 1.0], 3)
     error = rms(away)
     freedom = freedom_of(J.T @ J / len(J), error)
-    least = mean_square(pose.T) + error**2
-    slack = freedom.slack_mm.copy()
+    slack, T = freedom.slack_mm.copy(), pose.T
     for k in np.flatnonzero(slack > most / 2):
         turn, shift = most * freedom.motions[k, :3] / radius, most * freedom.motions[k, 3:]
-        moves = (turn_about(sign * turn, middle, sign * shift) for sign in (1, -1))
-        if min(mean_square(move @ pose.T) for move in moves) > least:
+        shares = np.linspace(-1, 1, 2 * SETTLING + 1)
+        for width in (1.0, 1 / SETTLING):
+            moves = [turn_about(w * turn, middle, w * shift) @ T for w in width * shares]
+            T = min(moves, key=mean_square)
+        ends = (turn_about(sign * turn, middle, sign * shift) @ T for sign in (1, -1))
+        if min(mean_square(end) for end in ends) > mean_square(T) + error**2:
             slack[k] = 0.0
-    return Freedom(np.sort(slack), freedom.motions[np.argsort(slack)]).shape(most)
+    return T, Freedom(np.sort(slack), freedom.motions[np.argsort(slack)]).shape(most)
 
 
 def _refuse_if_doubtful(pose: NominalPose) -> None:
