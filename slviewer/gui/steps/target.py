@@ -8,7 +8,7 @@ from slviewer.errors import InputError
 from slviewer.gui.panel import StepPanel
 from slviewer.gui.widgets import Html, LiveImage, Text, alert, coloured, link, paragraph, to_html
 from slviewer.pipeline.printouts import target as write_target
-from slviewer.target.board import EXAMPLES, Board, board_examples, plugin_boards
+from slviewer.target.board import EXAMPLES, LEGACY, Board, board_examples, plugin_boards
 from slviewer.wizard.snapshot import PreviewView
 
 KINDS = {
@@ -16,6 +16,7 @@ KINDS = {
     "Asymmetric circle grid": "acircles",
     "Chessboard": "chessboard",
     "ChArUco": "charuco",
+    "ChArUco before OpenCV 4.6": LEGACY,
 }
 DICTIONARIES = tuple(
     f"DICT_{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)
@@ -44,6 +45,8 @@ class TargetPanel(StepPanel):
         self._columns = self.number("Columns", board.columns, 2, 200, 1)
         self._rows = self.number("Rows", board.rows, 3, 200, 1)
         self._pitch = self.number("Pitch, mm", float(board.pitch_mm), 0.1, 1000.0, 0.01)
+        differs = "Along the columns, where the print differs there; 0: the same"
+        self._pitch_y = self.number("Pitch y, mm", 0.0, 0.0, 1000.0, 0.01, differs)
         self._marker = self.number("Marker, mm", 1.0, 0.1, 1000.0, 0.01)
         self._dictionary = self.dropdown("Dictionary", DICTIONARIES)
         self._note = Text(gui)
@@ -68,7 +71,7 @@ class TargetPanel(StepPanel):
             self._board = Board.parse(self._target) if self._target else None
             if self._board:
                 self._fill_fields(self._board)
-        self._marker.visible = self._dictionary.visible = self._kind.value == "charuco"
+        self._marker.visible = self._dictionary.visible = "charuco" in self._kind.value
         try:
             board = self._parse_entered()
         except InputError as error:
@@ -92,18 +95,21 @@ class TargetPanel(StepPanel):
 
     def _parse_entered(self) -> Board:
         """Return the board that the fields describe. Raises InputError for an invalid one."""
-        kind = self._kind.value
+        kind, along_y = self._kind.value, self._pitch_y.value
         notation = (
             f"{kind}:{int(self._columns.value)}x{int(self._rows.value)}:{self._pitch.value:g}"
         )
-        markers = f":{self._marker.value:g}:{self._dictionary.value}" if kind == "charuco" else ""
-        return Board.parse(notation + markers)
+        notation += f"x{along_y:g}" if along_y else ""
+        if "charuco" in kind:
+            notation += f":{self._marker.value:g}:{self._dictionary.value}"
+        return Board.parse(notation)
 
     def _fill_fields(self, board: Board) -> None:
         """Fill the fields from a board."""
-        self._kind.choose(board.kind)
+        self._kind.choose(LEGACY if board.legacy else board.kind)
         self._columns.value, self._rows.value = board.columns, board.rows
         self._pitch.value = float(board.pitch_mm)
+        self._pitch_y.value = 0.0 if board.pitch_y_mm == board.pitch_mm else board.pitch_y_mm
         if board.kind == "charuco":
             self._marker.value, self._dictionary.value = board.marker_mm, board.dictionary
 
