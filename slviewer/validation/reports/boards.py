@@ -7,7 +7,12 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.camera import calibrate_camera
-from slviewer.errors import BoardError
+from slviewer.errors import BoardError, CalibrationRejected
+from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.measure import measure
+from slviewer.pipeline.simulate import TARGET
+from slviewer.session.capture import NewCapture
+from slviewer.session.store import Session
 from slviewer.simulation.plans import target_poses
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
@@ -16,6 +21,8 @@ from slviewer.target.detect import Detection, detect
 from slviewer.validation.reports.case import Case, Outcome, Workplace
 
 _PIXELS_PER_SQUARE = 100
+CENTRE, DIAMETER_MM = np.array([14.0, 6.0, 640.0]), 196.0
+"""Of the plan's third sphere."""
 
 
 def _judge_stretch(_: Workplace, x: float, y: float, poses: int = 8) -> Outcome:
@@ -79,7 +86,44 @@ def _judge_picture(
     return Outcome(f"{message}; then {off:.2f} px off", right, is_named)
 
 
+def _judge_mirrored(
+    workplace: Workplace, flip: tuple[slice, ...], is_mirror: bool = True
+) -> Outcome:
+    """Calibrate from camera images that are flipped, which is refused by naming both devices; then,
+    as the remedy says, without the flip, and measure a sphere."""
+    base, folder = workplace.base(), workplace.folder / "flipped"
+    said = "calibrated"
+    with Session.open(base) as old, Session.create(folder) as new:
+        for role in ("calibration", "scan"):
+            captures = [
+                old.load_capture(n) for n in old.capture_names(role) if n[:4] in ("pose", "sphe")
+            ]
+            flipped = [
+                NewCapture(c.name, c.sequence, np.ascontiguousarray(c.frames[:, *flip]), None, "")
+                for c in captures
+            ]
+            new.save_captures(flipped, role, board=TARGET if role == "calibration" else None)
+    try:
+        calibrate(folder, target=TARGET)
+    except CalibrationRejected as error:
+        said = str(error)
+    x, y, z = CENTRE if is_mirror else -CENTRE
+    ball, session = (x, y, abs(z), DIAMETER_MM / 2 + 3), base if is_mirror else folder
+    diameter = measure(session, "sphere_3", "sphere", ball=ball).only["diameter"]
+    return Outcome(
+        f"{said}; then {diameter.value:.3f} mm, U {diameter.U:.3f} mm",
+        f"{'mirrored; ' if is_mirror else ''}{DIAMETER_MM:g} mm",
+        all((word in said) == is_mirror for word in ("text", "camera's mirror", "projector's"))
+        and 0 < abs(diameter.value - DIAMETER_MM) < (diameter.U or 0.0) < 0.05,
+    )
+
+
 CASES: dict[str, Case] = {
+    "camera image mirrored left to right": partial(_judge_mirrored, flip=np.s_[:, ::-1]),
+    "camera image mirrored top to bottom": partial(_judge_mirrored, flip=np.s_[::-1, :]),
+    "camera turned by 180 degrees": partial(
+        _judge_mirrored, flip=np.s_[::-1, ::-1], is_mirror=False
+    ),
     "print longer in x by 1 %": partial(_judge_stretch, x=0.01, y=0.0),
     "print longer in y by 0.3 %": partial(_judge_stretch, x=0.0, y=0.003),
     "print shorter in x by 3 %": partial(_judge_stretch, x=-0.03, y=0.0),
