@@ -13,7 +13,7 @@ OVER_NEXT, OVER_NINE = 4.0, 0.6
 cosine has 2.4 and 0.46 times as many, and crests of several heights, or with noise, have less."""
 BETWEEN = 0.2
 """Share of the samples of the brightest pixels that must lie between dark and bright: stripes have
-none, and their white is no plateau; a cosine of four times full scale has a fifth."""
+none, and their white is not a plateau; a cosine of four times full scale has a fifth."""
 COMB, OCCUPIED, COMPARED = 8.0, 0.25, 40
 """Largest over median bin of those compared below a plateau, above which the levels are too few to
 be judged; and share of the bins below which they are."""

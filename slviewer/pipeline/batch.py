@@ -237,7 +237,7 @@ def list_captures(address: str, task: Task) -> list[str]:
     with _fetch_session(address) as folder, Session.open(folder) as store:
         there = store.capture_names()
         if not patterns:
-            there = [c.name for c in store.captures("scan") if not c.is_imported_cloud]
+            there = [each.name for each in store.captures("scan", with_frames=True)]
     names = [name for name in there if any(fnmatchcase(name, each) for each in patterns or "*")]
     if not names:
         raise InputError(

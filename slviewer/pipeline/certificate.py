@@ -285,9 +285,8 @@ class _Repetition:
             _link(store.load_capture(name).folder, fresh.folder / "captures" / name)
         for name in fresh.capture_names("scan"):
             save_edits(fresh, name, load_edits(store, name))
-            if (capture := fresh.load_capture(name)).is_imported_cloud:
-                saved, arrays = store.load_result(f"clouds/{capture.name}")
-                fresh.save_result(f"clouds/{name}", _without_own(saved), arrays)
+            if fresh.load_capture(name).is_imported_cloud:
+                self._take_over(f"clouds/{name}")
         save_region(fresh, load_region(store))
         if (store.folder / NOMINALS).is_dir():
             _link(store.folder / NOMINALS, fresh.folder / NOMINALS)
@@ -295,6 +294,11 @@ class _Repetition:
             self.progress(0.1, "calibrating")
             self._calibrate()
         return collect_figures(fresh) | self._run_operations()
+
+    def _take_over(self, result: str) -> None:
+        """Copy a result of the session as it is."""
+        saved, arrays = self.store.load_result(result)
+        self.fresh.save_result(result, _without_own(saved), arrays)
 
     def _calibrate(self) -> None:
         """Calibrate from the frames with the settings of the session's calibration, and take over
@@ -312,8 +316,7 @@ class _Repetition:
             ]
             settings = CalibrateSettings(**record.settings)
             if settings.camera and store.has_result(str(settings.camera)):
-                saved, arrays = store.load_result(str(settings.camera))
-                fresh.save_result(str(settings.camera), _without_own(saved), arrays)
+                self._take_over(str(settings.camera))
             with self._note_failure(*results):
                 calibrate.run(fresh, replace(settings, models=models, poses=poses, exclude=()))
         else:

@@ -450,7 +450,7 @@ def import_opencv_calibration(
                 f"{store.folder} holds a {' and a '.join(there)} calibration already: "
                 "replace it with --force (it goes to the session's trash)"
             )
-        captures = [each for each in store.captures() if not each.is_imported_cloud]
+        captures = store.captures(with_frames=True)
         projectors = {capture.sequence.projector_size for capture in captures} - {None}
         sizes = {
             device: _resolve_size(path, device, given, stated, captured)

@@ -164,7 +164,7 @@ def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:
     states none."""
     if "model" in meta:
         return StereoModel.from_dict(meta["model"])
-    captures = [each for each in store.captures() if not each.is_imported_cloud]
+    captures = store.captures(with_frames=True)
     if not captures and not (meta["camera"] and meta["projector"]):
         raise SessionError(
             f"{store.folder} holds no capture that states the camera's size: import the scans first"
@@ -203,7 +203,7 @@ def load_stereo_if_complete(store: Session) -> StereoModel | None:
         return None
     meta = store.load_result("calibration/stereo", only=())[0]
     sized = "model" in meta or (meta["camera"] and meta["projector"])
-    sized = sized or any(not each.is_imported_cloud for each in store.captures())
+    sized = sized or store.captures(with_frames=True)
     return load_stereo(store) if sized else None
 
 

@@ -105,7 +105,7 @@ def reel(
     folder, recorded = expand_user(source), list[Recorded]()
     if layout == "session" or (layout is None and is_session(folder)):
         with Session.open(folder) as store:
-            recorded += [each for each in store.captures() if not each.is_imported_cloud]
+            recorded += store.captures(with_frames=True)
     else:
         layout = layout or "detect"
         recorded += find_captures(folder, layout, sequence, projector=projector).recordings

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
@@ -22,8 +21,8 @@ from slviewer.geometry.rigid import Floats, Floats32
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.geometry.vectors import lengths
-from slviewer.reconstruction.cloud import Misfit
-from slviewer.reconstruction.rig_change import CHANGES, bound_change, change_rig
+from slviewer.reconstruction.cloud import Misfit, number_tiles
+from slviewer.reconstruction.rig_change import bound_change, differentiate
 
 SAMPLE = 20_000
 """Pixels compared; more do not change a median."""
@@ -245,16 +244,13 @@ def _bound_change(
     rig = calibration.pinholes
     known, distance, noise = _misfit(rig, *calibration.undistort_pairs(pixels, measured), sigma)
     at = pixels[known], measured[known]
-    ends = [
-        [
-            epipolar_distance(
-                other, other.camera.undistort(at[0]), other.projector.undistort(at[1])
-            )[0]
-            for other in (change_rig(rig, unit), change_rig(rig, -unit))
-        ]
-        for unit in np.eye(CHANGES)
-    ]
-    values = np.stack([distance, noise, *((up - down) / 2 for up, down in ends)], axis=1)
+    changes = differentiate(
+        rig,
+        lambda other: epipolar_distance(
+            other, other.camera.undistort(at[0]), other.projector.undistort(at[1])
+        )[0],
+    )
+    values = np.column_stack([distance, noise, changes])
     values = np.column_stack([np.ones(len(values)), np.nan_to_num(values)])
     sums = _sum_by_tile(rig, at[0], values)
     count = sums[:, :1]
@@ -263,16 +259,10 @@ def _bound_change(
     return bound_change(effects, means[:, 0], sigma_px[:, 0])
 
 
-def _tiles(rig: StereoRig, pixels: Floats) -> NDArray[np.intp]:
-    """Return the number of the tile that each pixel (n, 2) lies in."""
-    place = (pixels[:, ::-1] * TILES / rig.camera.size[::-1]).astype(int)
-    return np.ravel_multi_index(tuple(place.T), TILES)
-
-
 def _sum_by_tile(rig: StereoRig, pixels: Floats, values: Floats) -> np.ndarray:
     """Return the sums (m, k) of ``values`` (n, k), the first of which are ones, over the tiles of
     enough of the pixels (n, 2)."""
-    tile = _tiles(rig, pixels)
+    tile = number_tiles(pixels, rig.camera.size, TILES)
     sums = np.stack([np.bincount(tile, column) for column in values.T], axis=1)
     return sums[sums[:, 0] >= LEAST_IN_TILE]
 
@@ -289,7 +279,7 @@ def local_misfit(
     """
     rig = calibration.pinholes
     known, distance, noise = _misfit(rig, *calibration.undistort_pairs(pixels, measured), sigma)
-    tile = _tiles(rig, pixels[known])
+    tile = number_tiles(pixels[known], rig.camera.size, TILES)
     excess = np.zeros(TILES, np.float32)
     for number in np.unique(tile):
         is_inside = tile == number

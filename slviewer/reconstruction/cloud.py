@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
@@ -13,6 +14,15 @@ Points = np.ndarray
 """Of an organised cloud (h, w, 3), or some of its points (n, 3), mm; or directions there."""
 Map = np.ndarray
 """(h, w): a value for each pixel of an organised cloud."""
+
+
+def number_tiles(
+    pixels: np.ndarray, size: tuple[int, int], tiles: tuple[int, ...]
+) -> NDArray[np.intp]:
+    """Return the number (n,) of the tile, of ``tiles`` (rows, columns) of an image of ``size``
+    (width, height), that each pixel (n, 2) lies in; of the nearest one outside."""
+    place = (pixels[:, ::-1] * tiles / size[::-1]).astype(int)
+    return np.ravel_multi_index(tuple(place.T), tiles, mode="clip")
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ neither noise nor the calibration's own uncertainty holds. A misfit, of the axes
 shape, says how large each change may have been; so large it is part of the uncertainty.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -18,14 +19,14 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.geometry.vectors import subsample
-from slviewer.reconstruction.cloud import Cloud, Misfit
+from slviewer.reconstruction.cloud import Cloud, Misfit, number_tiles
 
 SIZES = np.array([5e-3, 5e-3, 1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1])
 """Standard deviations of changes that occur: the focal lengths of camera and projector (share), the
 projector's turn about its axes (rad), its shift along them (mm)."""
 CHANGES = len(SIZES)
 MAX_REFERENCE_POINTS, LEAST_REFERENCE_POINTS = 400, 3
-"""Points of a scan whose common motion is no error."""
+"""Points of a scan, whose common motion is not an error."""
 EXPLAINED = 0.5
 """Share of the squares of a misfit, above which a change explains it."""
 MAX_TIMES = 5.0
@@ -41,6 +42,14 @@ def change_rig(rig: StereoRig, change: Floats) -> StereoRig:
         for lens, longer in ((rig.camera, step[0]), (rig.projector, step[1]))
     )
     return StereoRig(camera, projector, cv2.Rodrigues(step[2:5])[0] @ rig.R, rig.t + step[5:])
+
+
+def differentiate(rig: StereoRig, measure: Callable[[StereoRig], Floats]) -> Floats:
+    """Return how what ``measure`` returns of a rig, (...), changes with each of `SIZES`,
+    (..., 8)."""
+    units = np.eye(CHANGES)
+    changes = [measure(change_rig(rig, unit)) - measure(change_rig(rig, -unit)) for unit in units]
+    return np.stack(changes, axis=-1) / 2
 
 
 def bound_change(effects: Floats, misfit: Floats, sigma: Floats) -> Floats:
@@ -114,8 +123,7 @@ class PointResponse:
             return self.misfit.change[:, None] * effects
         pixels, _ = self._view(self._place(points))
         excess = self.misfit.excess_px
-        place = (pixels[:, ::-1] / self.rig.camera.size[::-1] * excess.shape).astype(int)
-        tile = np.ravel_multi_index(tuple(place.T), excess.shape, mode="clip")
+        tile = number_tiles(pixels, self.rig.camera.size, excess.shape)
         each = np.einsum("pni,ni->np", answers, self.by_px(points)) * excess.flat[tile][:, None]
         rows = np.zeros((excess.size, len(answers)))
         np.add.at(rows, tile, each)
@@ -138,12 +146,6 @@ class PointResponse:
     def _displace(self, places: Floats) -> Floats:
         """(n, 3, 8) mm: displacements of places (n, 3) in the camera's frame."""
         pixels, coordinate = self._view(places)
-        moved = [
-            (
-                triangulate_pixels(change_rig(self.rig, unit), pixels, coordinate, self.axis)
-                - triangulate_pixels(change_rig(self.rig, -unit), pixels, coordinate, self.axis)
-            )
-            / 2
-            for unit in np.eye(CHANGES)
-        ]
-        return np.stack(moved, axis=2)
+        return differentiate(
+            self.rig, lambda rig: triangulate_pixels(rig, pixels, coordinate, self.axis)
+        )

@@ -1,6 +1,5 @@
 """A nominal model from a file: checked, cleaned, and in millimetres."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +13,8 @@ from slviewer.geometry.vectors import lengths
 from slviewer.session import cad
 from slviewer.session.polygons import Polygons, read_polygons, to_polygons, triangulate_polygons
 from slviewer.session.reading import expand_user, read_input
-from slviewer.surface.shapes import Mesh
+from slviewer.session.results import digest_bytes
+from slviewer.surface.shapes import Mesh, list_neighbours
 
 Units = Literal["mm", "cm", "m", "inch"]
 NOMINALS = "nominal"
@@ -64,8 +64,7 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     in mm; or in a STEP or 3MF file, which states its units.
 
     Raises SessionError for a file that cannot be used, with the reason: one that is absent, too
-    large, damaged, truncated, of another format, without triangles, or with too
-    many.
+    large, damaged, truncated, of another format, without triangles, or with too many.
     """
     path = expand_user(path)
     if path.suffix.lower() not in FORMATS:
@@ -85,7 +84,7 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     polygons = _merge_vertices(path.name, polygons, MM[units or "mm"])
     faces = triangulate_polygons(polygons, notes)
     mesh, closed = _repair(path.name, polygons.vertices, faces, notes)
-    digest = hashlib.blake2b(data, digest_size=20).hexdigest()
+    digest = digest_bytes(data).hex()
     return Nominal(mesh, path.name, digest, units, closed, tuple(notes))
 
 
@@ -232,16 +231,12 @@ def _orient_faces(
 def _turn_alike(mesh: Any) -> np.ndarray | None:
     """Faces (m, 3) of a manifold turned one way, each part of the surface the way in which most of
     its area faces; None where that is impossible."""
-    from trimesh.grouping import group_rows
-
-    pairs = group_rows(mesh.edges_sorted, require_count=2)
-    one, other = mesh.edges_face[pairs].T
-    alike = mesh.edges[pairs[:, 0], 0] == mesh.edges[pairs[:, 1], 0]
-    m = len(mesh.faces)
+    pairs, alike = list_neighbours(mesh.faces)
+    (one, other), m = pairs.T, len(mesh.faces)
     # a node for each face as it is, and one for it turned: two components a part, which are its two
     # orientations
     start = np.concatenate([one, one + m])
-    end = np.concatenate([np.where(alike, other + m, other), np.where(alike, other, other + m)])
+    end = np.concatenate([np.where(alike, other, other + m), np.where(alike, other + m, other)])
     links = coo_matrix((np.ones(len(start), np.int8), (start, end)), (2 * m, 2 * m))
     labels = connected_components(links, directed=False)[1]
     as_is, turned = labels[:m], labels[m:]

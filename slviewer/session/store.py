@@ -162,10 +162,14 @@ class Session(Decisions):
         place."""
         return sorted(layout.inner_folders(self.folder / "captures"), key=natural_key)
 
-    def captures(self, role: Role | None = None) -> list[Capture]:
+    def captures(self, role: Role | None = None, *, with_frames: bool = False) -> list[Capture]:
         """The captures (of one role) in the order of `capture_names`, without damaged ones; frames
-        stay on disk."""
-        return [capture for capture in self.read_captures()[0] if role in (None, capture.role)]
+        stay on disk. ``with_frames``: without imported clouds."""
+        return [
+            each
+            for each in self.read_captures()[0]
+            if role in (None, each.role) and not (with_frames and each.is_imported_cloud)
+        ]
 
     def read_captures(self) -> tuple[list[Capture], dict[str, str]]:
         """The captures, and of every other folder in their place {name: what is wrong with it, and

@@ -189,6 +189,15 @@ def count_edges(faces: np.ndarray) -> tuple[np.ndarray, ...]:
     return half, *np.unique(keys, return_index=True, return_inverse=True, return_counts=True)[1:]
 
 
+def list_neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs (k, 2) of faces (m, 3) that share an edge with no third one, and whether
+    both are wound alike (k,) bool: they run along that edge in opposite directions then."""
+    half, _, edge, count = count_edges(faces)
+    order = np.argsort(edge, kind="stable")
+    order = order[count[edge[order]] == 2].reshape(-1, 2)
+    return order % len(faces), np.ptp(half[order, 0], axis=1) != 0
+
+
 def label_connected(pairs: np.ndarray, count: int) -> np.ndarray:
     """Return the connected part (count,) int of each of ``count`` nodes that ``pairs`` (k, 2) of
     them join."""

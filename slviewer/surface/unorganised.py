@@ -1,4 +1,4 @@
-"""Points that are no neighbours by their pixels: their noise and normals, and fusing them."""
+"""Points without pixels that make them neighbours: their noise and normals, and fusing them."""
 
 from collections.abc import Mapping
 

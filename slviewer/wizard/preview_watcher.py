@@ -88,7 +88,7 @@ class Watcher:
         if watch.board != self.watch.board:
             board, missing = None, ""
         rate = round(self._rate, 1)
-        light = brightness(frame, int(white))
+        light = brightness(frame, white)
         level = to_eight_bits(np.array([[white]], frame.dtype), full_scale, int(frame.max()))
         image = np.where(image < level, image, np.uint8(255))
         self._analysed(PreviewView(self._number, image, scale, *light, board, missing, None, rate))
@@ -166,10 +166,10 @@ def reduced(
     return to_eight_bits(small, full_scale, int(frame.max(initial=0))), scale
 
 
-def brightness(frame: np.ndarray, full_scale: int | None = None) -> tuple[float, float, np.ndarray]:
+def brightness(frame: np.ndarray, white: float | None = None) -> tuple[float, float, np.ndarray]:
     """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,)
-    of shares)."""
-    white = image_white(frame, full_scale)
+    of shares); ``white``: level at which the camera clips, by default that of the frame."""
+    white = image_white(frame) if white is None else white
     some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
     some = np.minimum(some, int(white))
     brightest = float(np.percentile(some, 99.5, method="inverted_cdf"))

@@ -4,7 +4,6 @@ Read are OpenCV FileStorage (YAML, XML, JSON), camera_info of ROS, camchain.yaml
 exports of MATLAB's cameraParameters as YAML or JSON, by the names of their entries.
 """
 
-import hashlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats
 from slviewer.session.importers.filestorage import Storage, read_storage
 from slviewer.session.reading import expand_user
+from slviewer.session.results import digest_bytes
 
 MATRICES = (
     "kcamera", "cameramatrix", "cameramatrix1", "intrinsicmatrix", "intrinsics", "camk", "kcam",
@@ -91,7 +91,7 @@ def read_camera_file(path: Path | str, size: tuple[int, int]) -> CameraFile:
     return CameraFile(
         lens,
         path.name,
-        hashlib.blake2b(path.read_bytes(), digest_size=20).hexdigest(),
+        digest_bytes(path.read_bytes()).hex(),
         None if sigma is None else float(np.max(sigma.ravel() / np.diag(K)[: sigma.size])),
         tuple(notes),
     )

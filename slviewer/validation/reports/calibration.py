@@ -93,7 +93,7 @@ def _fixed_lens(workplace: Workplace) -> Outcome:
         without = "rejected"
     _calibrate(session, file, True)
     found = measure(session, "sphere", "sphere", ball=(*_CENTRE_MM, 101.0), model="splined").only
-    diameter = next(each for each in found.quantities if each.name == "diameter")
+    diameter = found["diameter"]
     with Session.open(session) as store:
         model = load_model(store, "splined")
     assert isinstance(model, SplinedModel)

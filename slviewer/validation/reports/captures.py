@@ -84,7 +84,7 @@ def _judge_cells(
     edge: Callable[[np.ndarray], np.ndarray],
     offset_rad: float = 0.0,
 ) -> Outcome:
-    """Examine fringes that are no whole number of pixels, with a Gray code whose cells ``edge``
+    """Examine fringes whose width is not whole in pixels, with a Gray code whose cells ``edge``
     numbers by column; follow the remedies, one after the other, and decode."""
     columns = np.arange(extent)
     order = edge(columns)

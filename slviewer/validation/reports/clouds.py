@@ -65,7 +65,7 @@ def _measure_ball(name: str, write: Callable[[Path, np.ndarray], None], at: Work
         made = import_cloud(session, [path], unit="m", force=True).only
     region = (*_CENTRE.tolist(), _RADIUS + 5)
     found = measure(session, path.stem, "sphere", ball=region).only
-    radius = next(each for each in found.quantities if each.name == "radius")
+    radius = found["radius"]
     assert made.noise_mm is not None and radius.U is not None
     return Outcome(
         f"radius {radius.value:.4f} +- {radius.U:.4f} mm, noise {1000 * made.noise_mm:.1f} um",
