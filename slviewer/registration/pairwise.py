@@ -6,7 +6,6 @@ slides on a plane, a sphere turns in a sphere), and no other pose fits as well.
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,7 +88,7 @@ def register_prepared(
     """Align a scan with a reference that shows part of the same object, of ``size`` mm.
 
     ``start``: the initial pose, or the result of an earlier ``search_starts``, which is run
-    otherwise, and where the initial pose leads nowhere. ``markers``: those that both scans show,
+    otherwise. ``markers``: those that both scans show,
     from whose pose it starts, and which hold what the shape leaves open; alone, where the surfaces
     do not overlap. ``progress`` receives the share of the work done, 0 to 1, and may raise to
     cancel.
@@ -122,9 +121,6 @@ def register_prepared(
                 result = replace(result, rival_mm=_check_rival(scan, result, rival, given))
         progress(1.0)
         return result
-    if isinstance(start, Candidate) and not start.is_decided:
-        with suppress(Refused):  # the start was wrong
-            return register_prepared(scan, reference, size)
     raise refusals[0]  # the best start's refusal says most
 
 

@@ -161,10 +161,12 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
 
 
 @pytest.mark.slow
-def test_a_start_that_leads_nowhere_gives_way_to_features() -> None:
+def test_a_start_that_leads_nowhere_is_refused_and_not_replaced() -> None:
     T = motion(60.0, 150.0)
     scan, reference = view(bumpy(2), (-45, 75), 1, T), view(bumpy(2), (-75, 45), 2)
-    found = register(scan, reference, Candidate(np.eye(4), "initial"))
+    with pytest.raises(Refused):
+        register(scan, reference, Candidate(np.eye(4), "initial"))
+    found = register(scan, reference)
     assert found.start == "features" and error(found, T)[0] < 0.03 and found.rival_mm is None
 
 

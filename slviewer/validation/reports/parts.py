@@ -209,9 +209,9 @@ def _turn_nut(workplace: Workplace) -> Outcome:
 
 
 def _turn_stone(workplace: Workplace) -> Outcome:
-    """A worn stone has one pose: it merges from identity without a warning."""
+    """A worn stone has one pose: it merges from the turntable's angle without a warning."""
     session = _scan(workplace, "stone_1", "stone_2")
-    record, warnings = _merge(session, "stone_2", "stone_1", start="identity")
+    record, warnings = _merge(session, "stone_2", "stone_1", start="turntable", angle=STEP_DEG)
     turned = record.pairs["stone_2"].turned_deg
     return Outcome(
         f"{turned:.3f} degrees, {len(warnings)} warnings",
@@ -387,7 +387,7 @@ CASES: dict[str, Case] = {
     "studs moved by most of a pitch, from identity": _studs_case("stud"),
     "studs with one small lug, from identity": _studs_case("lug"),
     "a nut turned within its symmetry, from identity": _turn_nut,
-    "a stone without symmetry, from identity": _turn_stone,
+    "a stone without symmetry, by its angle": _turn_stone,
     "a shallow slot that is missing": _judge_slot,
     "a right part of which half was measured": _judge_little,
     "an open model that faces inwards": _turned_case(_invert, "pass, and said", 56),
