@@ -33,7 +33,7 @@ from slviewer.registration.refine import WORDS, Freedom, Shape, freedom_of
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import PreparedScan, prepare_scan
 from slviewer.registration.start import search_starts
-from slviewer.surface.shapes import Mesh, count_edges, label_connected, list_neighbours
+from slviewer.surface.shapes import Mesh, count_edges, label_connected, list_adjacent_faces
 
 RIM = 0.5
 """Cosine: what the rim of an open surface faces less than this lies beyond it, not above it."""
@@ -142,7 +142,7 @@ class NominalSurface:
         """Return which triangles (m,) bool face away from a scan's points (n, 3), with normals
         (n, 3), at ``T`` (4, 4): of patches that are wound alike, those that most of the points
         within ``reach`` mm show from behind."""
-        pairs, alike = list_neighbours(self._faces)
+        pairs, alike = list_adjacent_faces(self._faces)
         patch = label_connected(pairs[alike], len(self._faces))
         moved = (move_points(T, points) - self.middle).astype(np.float32)
         nearest = self._scene.compute_closest_points(open3d().core.Tensor(moved))

@@ -14,7 +14,7 @@ from slviewer.session import cad
 from slviewer.session.polygons import Polygons, read_polygons, to_polygons, triangulate_polygons
 from slviewer.session.reading import expand_user, read_input
 from slviewer.session.results import digest_bytes
-from slviewer.surface.shapes import Mesh, list_neighbours
+from slviewer.surface.shapes import Mesh, list_adjacent_faces
 
 Units = Literal["mm", "cm", "m", "inch"]
 NOMINALS = "nominal"
@@ -231,7 +231,7 @@ def _orient_faces(
 def _turn_alike(mesh: Any) -> np.ndarray | None:
     """Faces (m, 3) of a manifold turned one way, each part of the surface the way in which most of
     its area faces; None where that is impossible."""
-    pairs, alike = list_neighbours(mesh.faces)
+    pairs, alike = list_adjacent_faces(mesh.faces)
     (one, other), m = pairs.T, len(mesh.faces)
     # a node for each face as it is, and one for it turned: two components a part, which are its two
     # orientations

@@ -189,7 +189,7 @@ def count_edges(faces: np.ndarray) -> tuple[np.ndarray, ...]:
     return half, *np.unique(keys, return_index=True, return_inverse=True, return_counts=True)[1:]
 
 
-def list_neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def list_adjacent_faces(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pairs (k, 2) of faces (m, 3) that share an edge with no third one, and whether
     both are wound alike (k,) bool: they run along that edge in opposite directions then."""
     half, _, edge, count = count_edges(faces)
