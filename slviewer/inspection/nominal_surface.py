@@ -42,6 +42,8 @@ SETTLING = 8
 many between two of them."""
 CORNER = 1e-4
 """Barycentric: nearer to a side than this, the nearest place lies on it."""
+UNDAMPED = 1e-9
+"""Of the trace of the information of a fit: raised where a step did not reduce the cost."""
 NEGLIGIBLE = 1e-4
 """mm: directions from nearer than this to the surface are rounding."""
 MIN_NORMAL_COSINE = 0.5
@@ -219,29 +221,39 @@ def fit_pose(
     report: Progress = lambda share: None,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Fit the pose of least squared distances of the points that belong to the nominal, by
-    Gauss-Newton; ``robust``: by fewer iterations, with Tukey's weights, on either side of it.
+    Gauss-Newton, damped where a step does not reduce their capped mean, as along a face that slides
+    on itself; ``robust``: by fewer iterations, with Tukey's weights, on either side of it.
 
     Returns T (4, 4), and of the points in the last iteration their places (k, 3), the Jacobian
     (k, 6) about the mean of these, and distances (k,) mm. Raises InputError for too few.
     """
-    T, iterations = np.array(T, np.float64), FEW_ITERATIONS if robust else MAX_ITERATIONS
+    trial, iterations = np.array(T, np.float64), FEW_ITERATIONS if robust else MAX_ITERATIONS
+    damping, least = UNDAMPED, np.inf
     for turn in range(iterations):
         report(turn / iterations)
-        away, towards = surface.distances(points, normals, T, reach, either_side=robust)
-        counted = np.isfinite(away)
-        if np.count_nonzero(counted) < MIN_COUNTED:
+        off, towards = surface.distances(points, normals, trial, reach, either_side=robust)
+        counted, cost = np.isfinite(off), float(np.mean(_cap(off / reach)))
+        if cost >= least and not robust:  # nothing held the step
+            damping *= 100
+        elif np.count_nonzero(counted) < MIN_COUNTED:
             raise InputError(
                 f"Only {np.count_nonzero(counted)} points of the scan lie within {reach:.3g} mm of"
                 " the nominal model: does it show that part?"
             )
-        moved, away = move_points(T, points[counted]), away[counted]
-        middle = moved.mean(axis=0)
-        J = distance_jacobian(moved - middle, towards[counted])
-        weighted = J * tukey_weights(away, reach / 4.685)[:, None] if robust else J
-        change = -np.linalg.lstsq(weighted.T @ J, weighted.T @ away, rcond=1e-10)[0].astype(float)
-        T = turn_about(change[:3], middle, change[3:]) @ T
+        else:
+            T, least = trial, cost
+            moved, away = move_points(T, points[counted]), off[counted]
+            middle = moved.mean(axis=0)
+            J = distance_jacobian(moved - middle, towards[counted])
+        scale = np.repeat([rms_length(moved - middle), 1.0], 3)
+        scaled = J / scale
+        weighted = scaled * tukey_weights(away, reach / 4.685)[:, None] if robust else scaled
+        information = weighted.T @ scaled
+        information += damping * np.trace(information) * np.eye(6)
+        change = -np.linalg.solve(information, weighted.T @ away) / scale
         if np.abs(J @ change).max() < (1e-3 if robust else 1e-5):
             break
+        trial = turn_about(change[:3], middle, change[3:]) @ T
     return T, moved, J, away
 
 
