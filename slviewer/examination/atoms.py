@@ -1,6 +1,7 @@
 """Patterns of an axis as functions of the projector coordinate."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -33,6 +34,18 @@ class Atoms:
         below = place.astype(int)
         part = (place - below).astype(np.float32)
         return self.values[:, below] * (1 - part) + self.values[:, below + 1] * part
+
+    def displaced(self, motion_px: Sequence[float]) -> "Atoms":
+        """Return the same of a pattern that is displaced by so many px in each of the frames."""
+        place = np.arange(self.values.shape[1])
+        shifts = np.array(motion_px) / self.step_px
+        # between two steps of the table an edge of stripes would be blurred
+        shifts = np.where(self.groups < 0, np.rint(shifts), shifts)
+        moved = [
+            np.interp(place + shift, place, values)
+            for shift, values in zip(shifts, self.values, strict=True)
+        ]
+        return replace(self, values=np.array(moved, np.float32))
 
     def slope_at(self, coordinate: np.ndarray) -> np.ndarray:
         """Return the change (k, p) of the values per px at coordinates (p,) px."""

@@ -24,6 +24,7 @@ class Hypothesis:
     ``cause``: the fault that it stands for, None for the capture as described; ``frames``: those
     that it names; ``axis``: that it concerns, None for all; ``value``: of the description, where it
     changes one; ``cost``: misfit that simpler hypotheses are allowed before this one is chosen.
+    ``motion_px``: displacement of the pattern in each frame along ``axis``; empty for none.
     """
 
     cause: Cause | None
@@ -33,6 +34,7 @@ class Hypothesis:
     axis: Axis | None = None
     value: float | None = None
     cost: float = 0.0
+    motion_px: tuple[float, ...] = ()
 
     @property
     def changed(self) -> list[int]:
@@ -80,9 +82,12 @@ class Evaluator:
 
     def atoms(self, hypothesis: Hypothesis, axis: Axis) -> Atoms:
         """Return the patterns of an axis."""
-        key = _list_conventions(hypothesis.sequence, axis)
+        key = _list_conventions(hypothesis, axis)
         if key not in self._atoms:
-            self._atoms[key] = tabulate_atoms(hypothesis.sequence, axis)
+            atoms = tabulate_atoms(hypothesis.sequence, axis)
+            if hypothesis.motion_px and hypothesis.axis in (axis, None):
+                atoms = atoms.displaced([hypothesis.motion_px[i] for i in atoms.frames])
+            self._atoms[key] = atoms
         return self._atoms[key]
 
     def match(self, hypothesis: Hypothesis, axis: Axis) -> Match | None:
@@ -91,7 +96,7 @@ class Evaluator:
         images = tuple(hypothesis.images[i] for i in atoms.frames)
         if sample is None or not sample.swing.size or len(images) - images.count(None) < 4:
             return None
-        key = _list_conventions(hypothesis.sequence, axis), images
+        key = _list_conventions(hypothesis, axis), images
         if key not in self._matches:
             self._matches[key] = match(sample, atoms, list(images))
         return self._matches[key]
@@ -196,10 +201,12 @@ def _select_own(hypotheses: Sequence[Hypothesis], axis: Axis) -> Hypothesis:
     return next((h for h in hypotheses if h.axis == axis), hypotheses[0])
 
 
-def _list_conventions(sequence: PatternSequence, axis: Axis) -> tuple[object, ...]:
-    """Return all of a description that the patterns of an axis depend on."""
+def _list_conventions(hypothesis: Hypothesis, axis: Axis) -> tuple[object, ...]:
+    """Return all of a hypothesis that the patterns of an axis depend on."""
+    sequence = hypothesis.sequence
     return (
-        axis, tuple(sequence.frames[i] for i in sequence.select(axis)), sequence.projector_size,
+        axis, hypothesis.motion_px if hypothesis.axis in (axis, None) else (),
+        tuple(sequence.frames[i] for i in sequence.select(axis)), sequence.projector_size,
         sequence.sign(axis), sequence.offset_rad(axis), sequence.origin_px(axis),
         sequence.gray_cell(axis),
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """Examination of a capture: what its frames contradict, by the best explanation of all of them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +32,7 @@ from slviewer.fringe.decoding_task import prepare_decoding
 from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.levels import layout_levels
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.verdict import Examination, Finding
 
 
@@ -64,7 +64,7 @@ def _judge(
     found = explain(evaluator, base)
     # the first image has none before it, and stands out from those that have a ghost
     is_first = len(found) == 1 and found[0].cause == "duplicate-frame"
-    if motion and _is_moving_still(evaluator, found, motion):
+    if motion and _is_displaced(evaluator, found):
         found = ()
     if found and not (ghost and is_first):
         return _describe_explanation(found, evaluator, base)
@@ -97,24 +97,14 @@ def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evalu
     return evaluator if rivals and max(rivals) < equal.compare(base, base).loss else equal
 
 
-def _is_moving_still(
-    evaluator: Evaluator, found: Explanation, motion: Mapping[Axis, float]
-) -> bool:
-    """Return whether the steps are displaced also where an explanation is true, which accounts only
-    for a part of what motion does then, or where it is a frame that shows no other pattern."""
-    for hypothesis in found:
-        is_strange = hypothesis.cause == "duplicate-frame" and hypothesis.value is None
-        if is_strange and is_displaced(
-            evaluator, described(hypothesis.sequence), *hypothesis.frames
-        ):
-            return True
-        own = {a: px for a, px in motion.items() if hypothesis.axis in (a, None)}
-        left = measure_motion(evaluator, _fill_in(hypothesis))
-        if any(
-            abs(left.get(axis, 0.0)) > limits.STILL_MOVING * abs(px) for axis, px in own.items()
-        ):
-            return True
-    return False
+def _is_displaced(evaluator: Evaluator, found: Explanation) -> bool:
+    """Return whether frames that show no other pattern show their own one displaced."""
+    return any(
+        hypothesis.cause == "duplicate-frame"
+        and hypothesis.value is None
+        and is_displaced(evaluator, described(hypothesis.sequence), *hypothesis.frames)
+        for hypothesis in found
+    )
 
 
 def _describe_explanation(
@@ -126,6 +116,8 @@ def _describe_explanation(
     the other, is motion between them.
     """
     sequence, first, axis = base.sequence, found[0], found[0].axis
+    if first.cause == "moved" and axis is not None and first.value is not None:
+        return [describe_motion(sequence, axis, first.value)]
     is_offset = len(found) == 1 and first.cause == "phase-offset" and len(sequence.axes) == 2
     if axis is not None and is_offset and not sequence.find("gray", axis):
         *_, (period, steps) = sequence.phase_shifts(axis)

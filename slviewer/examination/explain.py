@@ -11,6 +11,7 @@ from slviewer.examination.evaluate import Evaluator, Hypothesis, MisfitChange, d
 from slviewer.examination.hypotheses import (
     exchange,
     list_descriptions,
+    list_motions,
     list_neighbours,
     list_orders,
     recover_orders,
@@ -109,7 +110,11 @@ def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
         _rank(evaluator, base, list_descriptions(sequence, axis))[: limits.KEPT // 2]
         for axis in evaluator.sample.by_axis
     ]
-    rated += [_rate(evaluator, base, (h,)) for ranked in by_axis for _, h in ranked]
+    moved = [
+        _rank(evaluator, base, list_motions(sequence, axis))[: limits.KEPT // 2]
+        for axis in evaluator.sample.by_axis
+    ]
+    rated += [_rate(evaluator, base, (h,)) for ranked in by_axis + moved for _, h in ranked]
     if len(by_axis) == 2:
         joint = [_rate(evaluator, base, (a, b)) for (_, a), (_, b) in product(*by_axis)]
         rated += [r for r in joint if r.comparison.sigmas > limits.SIGMAS]
@@ -204,6 +209,8 @@ def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained:
             if a is None or b is None or b.misfit.mean() > limits.EXPLAINED * a.misfit.mean():
                 return False
         return True
+    if first.cause == "moved":
+        return rated.net > limits.EXPLAINED_BY_MOTION * rated.comparison.loss
     if rated.net + gained > limits.EXPLAINED * rated.comparison.loss:
         return True
     is_less = np.nansum(after) < limits.LEFT_OF_FRAMES * np.nansum(before)

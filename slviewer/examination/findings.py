@@ -356,7 +356,7 @@ def describe_unresolved(sequence: PatternSequence, frames: Sequence[int]) -> Fin
 def describe_motion(sequence: PatternSequence, axis: Axis, displacement: float) -> Finding:
     """Return the finding of a scene, or a rig, that moved during the phase steps of an axis;
     ``displacement`` px of the projector."""
-    period = sequence.periods_px(axis)[-1]
+    period = sequence.period_px(axis)
     is_much = abs(displacement) > limits.MUCH_MOTION * period
     text = (
         f"something moved: from the first to the last phase step the pattern of axis {axis} shifted"

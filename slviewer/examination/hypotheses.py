@@ -18,6 +18,8 @@ Change = Callable[..., Hypothesis]
 FRACTIONS, LEAST_TURNS = 16, 0.1
 """Parts of a period by which the phase may be shifted, and the least shift that harms and that blur
 does not imitate: Gray code is unwrapped within a quarter."""
+MOTIONS, JUMPS = (0.1, 0.2, 0.4, 0.8, 1.6), (0.12, 0.4)
+"""Displacements in finest periods that are tried: from first to last image; in one."""
 
 
 def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
@@ -75,6 +77,11 @@ def list_neighbours(hypothesis: Hypothesis) -> Iterator[Hypothesis]:
                 hypothesis.sequence, hypothesis.axis, phase_offset_rad=offset
             )
             yield replace(hypothesis, sequence=sequence, value=offset, cost=1.5 * CHANGE_COST)
+    if hypothesis.cause == "moved" and hypothesis.axis and hypothesis.value:
+        shape = np.array(hypothesis.motion_px) / hypothesis.value
+        for factor in (0.6, 0.8, 1.25, 1.6):
+            px = factor * hypothesis.value
+            yield _move(hypothesis.sequence, hypothesis.axis, shape, px)
     shift = {"frame-lag": _lag_from, "missing-frame": _miss}.get(str(hypothesis.cause))
     if shift and len(hypothesis.frames) == 1:
         first = hypothesis.frames[0]
@@ -185,6 +192,31 @@ def list_descriptions(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothe
     for turns in (0.25, 0.5, 0.75) if bits and shifts else ():
         origin = sequence.origin_px(axis) + (turns - 1) * cell
         yield change("gray-origin", origin, 3, gray_origin_px=origin)
+
+
+def list_motions(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothesis]:
+    """Yield displacements of the pattern along an axis: steady, and all at once in one image."""
+    frames, steps = (
+        sequence.select(axis),
+        [s for _, own in sequence.phase_shifts(axis) for s in own],
+    )
+    if not steps:  # blur of stripes imitates motion
+        return
+    span, every = sequence.period_px(axis), np.arange(len(sequence.frames))
+    steady = np.clip((every - frames[0]) / max(1, frames[-1] - frames[0]), 0, 1)
+    for shape in (steady, *((every >= i) * 1.0 for i in steps)):
+        for share in MOTIONS if shape is steady else JUMPS:
+            for px in (-share * span, share * span):
+                yield _move(sequence, axis, shape, px)
+
+
+def _move(sequence: PatternSequence, axis: Axis, shape: np.ndarray, px: float) -> Hypothesis:
+    """Return the hypothesis of a displacement by ``px`` in all, of a ``shape`` (n,) from 0 to 1."""
+    motion = tuple((px * shape).tolist())
+    cost = 1.5 * CHANGE_COST
+    return replace(
+        described(sequence), cause="moved", axis=axis, value=px, motion_px=motion, cost=cost
+    )
 
 
 def _list_phases(

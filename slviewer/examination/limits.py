@@ -61,6 +61,9 @@ EXPLAINED = 0.25
 """Share of the misfit that it must explain, or ..."""
 LEFT_OF_FRAMES = 0.6
 """... of the residual of the frames that it moves that may be left: noise is."""
+EXPLAINED_BY_MOTION = 0.05
+"""The same of motion, to which the projector's response and blur leave much: measured, motion
+explains nothing of sound captures."""
 LEFT_OF_EACH = 0.9
 """The same of each of two frames that have changed places."""
 RIVAL = 0.5
@@ -119,8 +122,6 @@ MUCH_MOTION = 0.03
 """The same, from which a capture must not be measured: a fringe is read to a hundredth."""
 USUAL_OFFSET = 0.02
 """Periods by which an offset of the phase may differ from a quarter or a step."""
-STILL_MOVING = 0.6
-"""Share of the displacement left by an explanation, from which motion explains more."""
 LEAST_GHOST, GHOST_SIGMAS = 0.02, 5.0
 """Share of the image before, that blur and gamma do not imitate, and in its standard errors."""
 
