@@ -36,6 +36,10 @@ class Hypothesis:
     cost: float = 0.0
     motion_px: tuple[float, ...] = ()
 
+    def motion_along(self, axis: Axis) -> tuple[float, ...]:
+        """Return ``motion_px`` along an axis; empty for none."""
+        return self.motion_px if self.axis == axis else ()
+
     @property
     def changed(self) -> list[int]:
         """Pattern frames that are seen in another image than their own, or in none."""
@@ -84,10 +88,11 @@ class Evaluator:
         """Return the patterns of an axis."""
         key = _list_conventions(hypothesis, axis)
         if key not in self._atoms:
-            atoms = tabulate_atoms(hypothesis.sequence, axis)
-            if hypothesis.motion_px and hypothesis.axis in (axis, None):
-                atoms = atoms.displaced([hypothesis.motion_px[i] for i in atoms.frames])
-            self._atoms[key] = atoms
+            if motion := hypothesis.motion_along(axis):
+                still = self.atoms(replace(hypothesis, motion_px=()), axis)
+                self._atoms[key] = still.displaced([motion[i] for i in still.frames])
+            else:
+                self._atoms[key] = tabulate_atoms(hypothesis.sequence, axis)
         return self._atoms[key]
 
     def match(self, hypothesis: Hypothesis, axis: Axis) -> Match | None:
@@ -205,7 +210,7 @@ def _list_conventions(hypothesis: Hypothesis, axis: Axis) -> tuple[object, ...]:
     """Return all of a hypothesis that the patterns of an axis depend on."""
     sequence = hypothesis.sequence
     return (
-        axis, hypothesis.motion_px if hypothesis.axis in (axis, None) else (),
+        axis, hypothesis.motion_along(axis),
         tuple(sequence.frames[i] for i in sequence.select(axis)), sequence.projector_size,
         sequence.sign(axis), sequence.offset_rad(axis), sequence.origin_px(axis),
         sequence.gray_cell(axis),

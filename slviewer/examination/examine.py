@@ -64,7 +64,7 @@ def _judge(
     found = explain(evaluator, base)
     # the first image has none before it, and stands out from those that have a ghost
     is_first = len(found) == 1 and found[0].cause == "duplicate-frame"
-    if motion and _is_displaced(evaluator, found):
+    if motion and _are_displaced(evaluator, found):
         found = ()
     if found and not (ghost and is_first):
         return _describe_explanation(found, evaluator, base)
@@ -97,7 +97,7 @@ def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evalu
     return evaluator if rivals and max(rivals) < equal.compare(base, base).loss else equal
 
 
-def _is_displaced(evaluator: Evaluator, found: Explanation) -> bool:
+def _are_displaced(evaluator: Evaluator, found: Explanation) -> bool:
     """Return whether frames that show no other pattern show their own one displaced."""
     return any(
         hypothesis.cause == "duplicate-frame"

@@ -106,14 +106,13 @@ def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
     pairs = _rank(evaluator, base, _list_pairs(evaluator, base, orders))
     kept = sorted([*orders, *pairs], key=lambda ranked: -ranked[0])[: limits.KEPT]
     rated = [_rate(evaluator, base, (h,)) for _, h in kept]
-    by_axis = [
-        _rank(evaluator, base, list_descriptions(sequence, axis))[: limits.KEPT // 2]
-        for axis in evaluator.sample.by_axis
-    ]
-    moved = [
-        _rank(evaluator, base, list_motions(sequence, axis))[: limits.KEPT // 2]
-        for axis in evaluator.sample.by_axis
-    ]
+    by_axis, moved = (
+        [
+            _rank(evaluator, base, list_all(sequence, axis))[: limits.KEPT // 2]
+            for axis in evaluator.sample.by_axis
+        ]
+        for list_all in (list_descriptions, list_motions)
+    )
     rated += [_rate(evaluator, base, (h,)) for ranked in by_axis + moved for _, h in ranked]
     if len(by_axis) == 2:
         joint = [_rate(evaluator, base, (a, b)) for (_, a), (_, b) in product(*by_axis)]

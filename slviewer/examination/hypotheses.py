@@ -196,12 +196,10 @@ def list_descriptions(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothe
 
 def list_motions(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothesis]:
     """Yield displacements of the pattern along an axis: steady, and all at once in one image."""
-    frames, steps = (
-        sequence.select(axis),
-        [s for _, own in sequence.phase_shifts(axis) for s in own],
-    )
+    steps = [i for _, indices in sequence.phase_shifts(axis) for i in indices]
     if not steps:  # blur of stripes imitates motion
         return
+    frames = sequence.select(axis)
     span, every = sequence.period_px(axis), np.arange(len(sequence.frames))
     steady = np.clip((every - frames[0]) / max(1, frames[-1] - frames[0]), 0, 1)
     for shape in (steady, *((every >= i) * 1.0 for i in steps)):

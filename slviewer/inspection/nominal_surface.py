@@ -245,12 +245,12 @@ def fit_pose(
             moved, away = move_points(T, points[counted]), off[counted]
             middle = moved.mean(axis=0)
             J = distance_jacobian(moved - middle, towards[counted])
-        scale = np.repeat([rms_length(moved - middle), 1.0], 3)
-        scaled = J / scale
-        weighted = scaled * tukey_weights(away, reach / 4.685)[:, None] if robust else scaled
-        information = weighted.T @ scaled
-        information += damping * np.trace(information) * np.eye(6)
-        change = -np.linalg.solve(information, weighted.T @ away) / scale
+            scale = np.repeat([rms_length(moved - middle), 1.0], 3)
+            scaled = J / scale
+            weighted = scaled * tukey_weights(away, reach / 4.685)[:, None] if robust else scaled
+            information, gradient = weighted.T @ scaled, weighted.T @ away
+        damped = information + damping * np.trace(information) * np.eye(6)
+        change = -np.linalg.solve(damped, gradient) / scale
         if np.abs(J @ change).max() < (1e-3 if robust else 1e-5):
             break
         trial = turn_about(change[:3], middle, change[3:]) @ T

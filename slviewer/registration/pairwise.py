@@ -88,10 +88,9 @@ def register_prepared(
     """Align a scan with a reference that shows part of the same object, of ``size`` mm.
 
     ``start``: the initial pose, or the result of an earlier ``search_starts``, which is run
-    otherwise. ``markers``: those that both scans show,
-    from whose pose it starts, and which hold what the shape leaves open; alone, where the surfaces
-    do not overlap. ``progress`` receives the share of the work done, 0 to 1, and may raise to
-    cancel.
+    otherwise. ``markers``: those that both scans show, from whose pose it starts, and which hold
+    what the shape leaves open; alone, where the surfaces do not overlap. ``progress`` receives the
+    share of the work done, 0 to 1, and may raise to cancel.
 
     Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not
     hold the pose, or where a second pose fits alike, between which a given start does not decide.
