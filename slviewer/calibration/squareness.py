@@ -30,6 +30,9 @@ ASPECTS = (0.5, 1.0, 2.0)
 MIN_SHARED = 0.25
 """The projector shares the camera's aspect, or not, where its own agrees to this share of it."""
 
+_MIN_FEATURES = 6
+"""Of a pose, fewer of which its own position explains whatever the pixels are."""
+
 
 @dataclass(frozen=True)
 class Squareness:
@@ -67,15 +70,18 @@ def measure_squareness(
 
     ``lens`` and ``poses``, T_camera_board (4, 4) mm: a solution from ``points`` (n, 3) mm and
     ``pixels`` (n, 2) of each pose, NaN where excluded. Takes one Gauss-Newton step from it; limits
-    are the jackknife's over the poses.
+    are the jackknife's over the poses, without those of too few features to tell.
     """
-    K, D, systems = lens.K, lens.D, []
+    K, D, systems, kept = lens.K, lens.D, [], []
     for T, X, measured in zip(poses, points, pixels, strict=True):
         used = finite_rows(measured)
-        X = X[used]
+        if np.count_nonzero(used) < _MIN_FEATURES:
+            continue
+        X, measured = X[used], measured[used]
+        kept.append((X, measured))
         rvec, _ = cv2.Rodrigues(T[:3, :3])
         projected, J = cv2.projectPoints(X, rvec, T[:3, 3], K, D)
-        residual = (measured[used] - projected[:, 0]).ravel()
+        residual = (measured - projected[:, 0]).ravel()
         on_board = J[:, 3:6].reshape(-1, 2, 3) @ T[:3, :3]  # by the features' positions, mm
         shear, stretch = (on_board[..., k] * X[:, 1, None] for k in (0, 1))
         aspect = K[1, 1] * J[:, 7]
@@ -83,6 +89,8 @@ def measure_squareness(
         shared = np.column_stack([focal, J[:, 8:15], aspect, shear.ravel(), stretch.ravel()])
         Q, _ = np.linalg.qr(J[:, :6])  # what a move of the board does not explain
         systems.append((shared - Q @ (Q.T @ shared), residual - Q @ (Q.T @ residual)))
+    if len(systems) < 2:
+        return Squareness(float(K[1, 1] / K[0, 0]), np.inf)
     described, described_limits = _fit_jackknife([(J[:, :-1], r) for J, r in systems])
     free, free_limits = _fit_jackknife(systems)
     squareness = Squareness(
@@ -95,7 +103,7 @@ def measure_squareness(
     )
     if not squareness.is_doubtful:
         return squareness
-    return replace(squareness, explaining=_explain_aspect(points, pixels, lens.size))
+    return replace(squareness, explaining=_explain_aspect(kept, lens.size))
 
 
 def _fit_jackknife(systems: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
@@ -116,16 +124,13 @@ def _fit_jackknife(systems: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Fl
     return x, stats.t.isf(DOUBT / 2, count - 1) * sigma
 
 
-def _explain_aspect(
-    points: Sequence[Floats], pixels: Sequence[Floats], size: tuple[int, int]
-) -> float:
+def _explain_aspect(features: Sequence[tuple[Floats, Floats]], size: tuple[int, int]) -> float:
     """Return the stretch of the board's y over its x with which the camera, solved again, has
     square pixels."""
-    used = [finite_rows(each) for each in pixels]
-    images = [each[rows] for each, rows in zip(pixels, used, strict=True)]
+    images = [pixels for _, pixels in features]
     stretch = 1.0
     for _ in range(3):
-        scaled = [X[rows] * [1.0, stretch, 1.0] for X, rows in zip(points, used, strict=True)]
+        scaled = [X * [1.0, stretch, 1.0] for X, _ in features]
         K, _, _, _ = solve_device("camera", scaled, images, size)
         stretch *= float(K[1, 1] / K[0, 0])
     return stretch
