@@ -39,6 +39,10 @@ class InputError(SlviewerError):
     """Frames, files or settings that cannot be used as they are."""
 
 
+class UnknownLayoutError(InputError):
+    """A folder of images whose names no layout knows, and that nothing describes."""
+
+
 class DetectionError(InputError):
     """A target that was not detected in an image."""
 

@@ -271,7 +271,7 @@ class GuessOptions:
 
     Args:
         guess: A capture folder, whose TOML is proposed from its images; nothing is imported. Exit
-            status 1 where a part of it is unsure.
+            status 1 where an image is not identified.
         out: File for the proposed TOML, by default standard output.
     """
 
@@ -321,11 +321,12 @@ def run_frames(import_captures: Function, arguments: Arguments) -> None:
     else:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(guessed.toml, encoding="utf-8")
-        terminal.print_result(f"written to {out}")
+        terminal.print_result("\n  ".join([f"written to {out}:", *guessed.summary]))
+    unsure = f"unsure: {'; '.join(guessed.doubts)}. Correct the entries marked UNSURE in the TOML"
+    if not guessed.is_complete:
+        raise InputError(unsure)
     if guessed.doubts:
-        raise InputError(
-            f"unsure: {'; '.join(guessed.doubts)}. Correct the entries marked UNSURE in the TOML"
-        )
+        terminal.warn(unsure)
 
 
 def run_import_calibration(import_calibration: Function, arguments: Arguments) -> None:

@@ -17,7 +17,7 @@ from typing import Any, get_args
 import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import InputError
+from slviewer.errors import InputError, UnknownLayoutError
 from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
@@ -36,6 +36,7 @@ from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.capture import Capture, NewCapture, Role
 from slviewer.session.importers import opencv_calibration
 from slviewer.session.importers.filestorage import read_storage
+from slviewer.session.importers.frames import guess_description
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
     FolderLayout,
@@ -216,7 +217,10 @@ def find_captures(
     source = expand_user(source)
     with _opened_if_there(session) as store:
         same = None if store is None else _layout_of_session(store, source)
-        chosen = _choose_layout(source, layout, sequence, same, warn)
+        try:
+            chosen = _choose_layout(source, layout, sequence, same, warn)
+        except UnknownLayoutError as error:
+            raise _suppose_layout(source, projector, channel, error) from error
         size, assumed, assumption = None if projector is None else parse_size(projector), None, ""
         if size is None and chosen.name != "frames":
             if store is not None and (assumed := _known_projector_size(store)) is not None:
@@ -239,6 +243,24 @@ def find_captures(
         return imports
     recordings = [replace(recording, channel=channel) for recording in imports.recordings]
     return replace(imports, recordings=recordings)
+
+
+def _suppose_layout(
+    source: Path, projector: Size | None, channel: Channel | None, error: UnknownLayoutError
+) -> UnknownLayoutError:
+    """Return the error that says what the images of an unknown layout show, as far as they suggest
+    it; the given error where there are too few of them."""
+    size = None if projector is None else parse_size(projector)
+    try:
+        guess = guess_description(source, size and f"{size[0]}x{size[1]}", channel)
+    except InputError:
+        return error
+    lines = [*guess.summary, *(f"unsure: {doubt}" for doubt in guess.doubts)]
+    return UnknownLayoutError(
+        "\n  ".join([f"{source} has none of the known layouts. What its images suggest:", *lines])
+        + "\n`slviewer import frames --guess FOLDER --out FOLDER/sequence.toml` writes this down:"
+        " correct it there, and import again"
+    )
 
 
 def describe_import(names: Sequence[str], role: Role) -> str:

@@ -148,12 +148,34 @@ def test_the_command_writes_a_description_that_is_read_back(
     assert [f.kind for f in described.frames] == [f.kind for f in sequence.frames]
     assert missing_facts(toml.read_text(), "UNSURE", "fringes per cell") == ["UNSURE"]
     capsys.readouterr()
-    assert main(["import", "frames", "--guess", str(folder), "--projector", "912x1140"]) == 1
+    # a doubt about an entry is a warning: the description is whole, and can be imported
+    assert main(["import", "frames", "--guess", str(folder), "--projector", "912x1140"]) == 0
     out, err = capsys.readouterr()
     assert not missing_facts(out, "# UNSURE") and not missing_facts(err, "unsure")
     assert len(tomllib.loads(out)["frame"]) == len(frames)
     assert main(["import", "frames", str(folder)]) == 2
     assert main(["import", "frames", "--guess", str(folder), str(tmp_path / "session")]) == 2
+
+
+def test_import_of_an_unknown_layout_says_what_the_images_suggest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, frames = taken("complementary 4")
+    folder, session = tmp_path / "my images" / "part 1", tmp_path / "session"
+    folder.mkdir(parents=True)
+    for k, frame in enumerate(frames):
+        cv2.imwrite(str(folder / f"[{k}]_img.png"), frame)
+    assert main(["import", "auto", str(tmp_path), str(session)]) == 1
+    assert not missing_facts(capsys.readouterr().err, f"'{folder.parent}'")
+    assert main(["import", "auto", str(folder.parent), str(session)]) == 1
+    err = capsys.readouterr().err
+    assert not missing_facts(err, "[0]_img.png to [3]_img.png: 4 phase steps along x", "--guess")
+    assert not session.exists()
+    toml = folder.parent / "sequence.toml"
+    guess = ["--guess", str(folder.parent), "--projector", "912x1140", "--out", str(toml)]
+    assert main(["import", "frames", *guess]) == 0
+    assert main(["import", "auto", str(folder.parent), str(session)]) == 0
+    assert not missing_facts(capsys.readouterr().out, "part_1")
 
 
 @pytest.mark.slow

@@ -140,9 +140,11 @@ def test_p18_folders_without_poses(tmp_path):
     (tmp_path / "pose_2" / "V").mkdir(parents=True)
     write_p18(tmp_path / "my pose")
     found = P18.read(tmp_path)
-    assert [recording.name for recording in found.recordings] == ["pose_1"]
-    assert [each.name for each in found.skipped] == ["pose_2", "my pose"]
-    assert "my pose" in found.skipped[1].reason
+    assert [recording.name for recording in found.recordings] == ["my_pose", "pose_1"]
+    assert [each.name for each in found.skipped] == ["pose_2"]
+    write_p18(tmp_path / "pose 1")
+    with raises(InputError, "pose_1"):
+        P18.read(tmp_path)
 
 
 def test_an_error_states_each_reason_once(tmp_path):

@@ -170,6 +170,11 @@ def test_a_layout_is_detected_or_the_known_ones_are_listed(tmp_path):
     write(tmp_path / "b" / "frameSeq_0.bmp", U / COLUMNS)
     with raises(InputError, "procam-calibration", "slstudio"):
         layouts.detect_layout(tmp_path)
+    above = tmp_path / "above"
+    for inner in ("a b/1", "c/d/2"):
+        write(above / inner / "graycode_00.png", U / COLUMNS)
+    with raises(InputError, f"'{above / 'a b'}'", above / "c" / "d"):
+        layouts.detect_layout(above)
     (tmp_path / "frames.toml").touch()
     assert layouts.detect_layout(tmp_path) == "frames"
     (tmp_path / "more.toml").touch()

@@ -68,6 +68,7 @@ exposure that did not saturate it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -461,11 +462,14 @@ LAYOUT = FolderLayout(
 
 @dataclass(frozen=True)
 class GuessedDescription:
-    """``toml``: the text, whose comments say what supports each entry. ``doubts``: what stays open;
-    empty where the description is sure."""
+    """``toml``: the text, whose comments say what supports each entry. ``summary``: a line for each
+    group of images, and the assumptions. ``doubts``: what stays open; empty where the description
+    is sure. ``is_complete``: whether every image is described, so that the TOML can be imported."""
 
     toml: str
+    summary: tuple[str, ...]
     doubts: tuple[str, ...]
+    is_complete: bool
 
 
 def guess_description(
@@ -496,7 +500,28 @@ def guess_description(
     doubts = tuple(
         f"{_format_span(names, indices)}: {text}{hint}" for indices, text in guess.doubts
     )
-    return GuessedDescription(_format_toml(folder, names, guess, shown, size, doubts), doubts)
+    toml = _format_toml(folder, names, guess, shown, size, doubts)
+    summary = (*_summarise_frames(names, guess.frames), *guess.notes)
+    return GuessedDescription(toml, summary, doubts, guess.sequence is not None)
+
+
+def _summarise_frames(names: list[str], frames: Sequence[Frame | None]) -> list[str]:
+    """Return a line for each group of neighbouring images of one kind and axis."""
+
+    def describe(index: int) -> str:
+        """Return what an image shows, the same for all images of a group."""
+        frame = frames[index]
+        if frame is None:
+            return "not identified"
+        along = f" along {frame.axis}" if frame.axis else ""
+        if frame.kind == "phase":
+            return f"{frame.steps} phase steps{along}, period {frame.period_px:g} px"
+        if frame.kind in ("gray", "inverse"):
+            return f"Gray code of {frame.bits} bits{along}"
+        return f"{frame.kind}{along}"
+
+    groups = groupby(range(len(names)), key=describe)
+    return [f"{_format_span(names, tuple(images))}: {text}" for text, images in groups]
 
 
 def _format_span(names: list[str], indices: tuple[int, ...]) -> str:

@@ -13,7 +13,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers.images import DEFAULT_CHANNEL, IMAGE_SUFFIXES, Channel, read_frames
-from slviewer.session.names import join_names, natural_key, new_name
+from slviewer.session.names import join_names, natural_key, new_name, plain_name
 from slviewer.session.reading import expand_user
 
 _MOST_REASONS = 3
@@ -267,7 +267,7 @@ def collect_captures(
     for folder in captures:
         try:
             name = f"{prefix}_{folder.name}" if prefix else folder.name
-            recording, more = describe(folder, new_name(name))
+            recording, more = describe(folder, new_name(plain_name(name, "capture")))
         except InputError as error:
             skipped.append(Skipped(folder.name, str(error)))
         except Exception as error:  # a plugin's own fault
@@ -281,6 +281,9 @@ def collect_captures(
             warnings += more
     if not recordings:
         raise none_usable(skipped)
+    for name in (names := [recording.name for recording in recordings]):
+        if names.count(name) > 1:
+            raise InputError(f"several folders of {source} would be called {name}: rename one")
     return Imports(recordings, warnings, skipped)
 
 

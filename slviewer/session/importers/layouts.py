@@ -37,12 +37,13 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from math import ceil, log2
 from pathlib import Path
+from shlex import quote
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from slviewer.entry_points import IMPORTERS, PluginGroup
-from slviewer.errors import InputError
+from slviewer.errors import InputError, UnknownLayoutError
 from slviewer.fringe.presets import AXES, gray, gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
 from slviewer.session.importers.frames import LAYOUT as FRAMES
@@ -445,7 +446,8 @@ def detect_layout(source: Path) -> str:
     """The name of the layout of a folder, by its file names. Raises InputError where it is none, or
     not one alone.
 
-    A TOML in the folder describes the images: it decides.
+    A TOML in the folder describes the images: it decides. Where folders further inside can be
+    imported, the error names them; UnknownLayoutError where there are none.
     """
     folders = list_folders(source)
     if find_description(folders[0]) is not None:
@@ -462,11 +464,29 @@ def detect_layout(source: Path) -> str:
             f"{source} holds captures of {' and '.join(candidates)}: name the layout, or import one"
             " at a time"
         )
+    if inside := [each for folder in folders[1:] for each in _list_sources(folder, 3)]:
+        shown = [quote(str(source / each.relative_to(folders[0]))) for each in inside]
+        raise InputError(
+            f"{source} holds no capture itself: give one of the folders in it, {join_names(shown)}"
+        )
     known = "; ".join(f"{layout.name}: {layout.holds}" for layout in layouts().values())
-    raise InputError(
+    raise UnknownLayoutError(
         f"{source} has none of the known layouts ({known}): describe the images in a TOML in the"
         " folder"
     )
+
+
+def _list_sources(folder: Path, depth: int) -> list[Path]:
+    """Return the folder where it holds captures that can be imported or guessed; else those inside
+    it that do, up to a depth."""
+    inside = list_folders(folder)[1:]
+    if any(entry.suffix.lower() == ".toml" for entry in visible(folder)) or any(
+        len(images_by_name(each)) >= 3
+        or any(known.recognises(each) for known in layouts().values())
+        for each in inside
+    ):
+        return [folder]
+    return [each for inner in inside if depth for each in _list_sources(inner, depth - 1)]
 
 
 def find_description(source: Path) -> Path | None:
