@@ -59,7 +59,7 @@ class App:
                 serve_device_pages(self.server, pages)
             self._context = PanelContext(operator, self.server, pages, print_links)
             page = self.server.viser
-            page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
+            page.gui.configure_theme(brand_color=_BRAND, control_width="large")
             page.initial_camera.position, page.initial_camera.look_at = OVERVIEW
             page.initial_camera.fov = FIELD_OF_VIEW
             page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0

@@ -17,7 +17,7 @@ import viser
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.evaluation.render import format_count
-from slviewer.gui.panel import NO_SESSION, ControlGroup, PanelContext, StepPanel
+from slviewer.gui.panel import NO_SESSION, ButtonColour, ControlGroup, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.widgets import (
     NOTICES,
@@ -44,11 +44,12 @@ from slviewer.wizard.snapshot import (
     StepView,
 )
 
-STEPS_PX, STEP_PX = 236, 452
-"""Widths of the two panels: at 1280 px of page, the scene is as wide as the step."""
+STEPS_PX, STEP_PX = 160, 340
+"""Widths of the two panels: at 1280 px of page, the scene keeps 60 % of it."""
 
 _ICONS = {"done": "circle-check", "ready": "circle-dotted", "blocked": "lock"}
-_STEP_COLOURS = {"done": (211, 249, 216), "ready": (208, 235, 255), "blocked": (233, 236, 239)}
+_STEP_COLOURS: dict[str, ButtonColour] = {"done": "green", "ready": "gray", "blocked": "gray"}
+"""Of the icons, by `page_style.css`; the shown step's button has the accent colour."""
 _STEPS_WITH_RIG = ("rig", "target", "poses", "calibrate")  # in which the devices matter in 3D
 STAGES = {
     "rig": "check-of-the-rig",
@@ -63,7 +64,6 @@ STAGES = {
 }
 """{step: anchor of the findings of its stage in the help}."""
 _HELP_STYLE = "float:right;font-size:0.875rem;line-height:1.9rem"
-_SCROLL_BAR_MARGIN = "<style>.mantine-ScrollArea-content{padding-right:10px}</style>"
 _QUIET_ZONE = 4
 """White modules around a QR code (ISO/IEC 18004)."""
 _MOST_NOTICES = 12  # of the latest, in the panel
@@ -93,8 +93,8 @@ class Shell(ControlGroup):
     # building
 
     def _build_left(self, steps: Sequence[StepView]) -> None:
-        """Build the left panel: buttons of the steps, autopilot, session and messages."""
-        gui, operator = self._gui, self._operator
+        """Build the left panel: buttons of the steps, autopilot, session and progress."""
+        gui = self._gui
         gui.main_panel.dock_left()
         gui.main_panel.set_width(STEPS_PX)
         self._step_buttons = {
@@ -105,11 +105,33 @@ class Shell(ControlGroup):
         }
         gui.add_divider()
         self._autopilot = self.button(
-            "Autopilot", self._toggle_autopilot, "player-play", "teal", at_once=True
+            "Autopilot", self._toggle_autopilot, "player-play", at_once=True
         )
         self._autopilot.visible = False
-        self._autopilot_status = Text(gui)
-        with gui.add_folder("Session", expand_by_default=True):
+        self._counts = Text(gui)
+        self._busy = Text(gui)
+
+    def _build_right(self, steps: Sequence[StepView]) -> None:
+        """Build the right panel: the shown step with its problems and progress; the session; the
+        messages."""
+        gui, operator = self._gui, self._operator
+        panel = gui.add_panel()
+        panel.dock_right()
+        panel.set_width(STEP_PX)
+        with panel.add_tab("Step"):
+            self._heading = Text(gui)
+            self._faults = Text(gui)
+            self._autopilot_status = Text(gui)
+            self._progress = Text(gui)
+            self._cancel = self.button("Cancel", operator.cancel, "player-stop", at_once=True)
+            self._next = self.button(
+                "Continue", lambda: self.go(self._following_key), "arrow-right", None
+            )
+            self._cancel.visible = self._next.visible = False
+            for key in (step.key for step in steps):
+                module = importlib.import_module(f"slviewer.gui.steps.{key}")
+                self._panels[key] = getattr(module, f"{key.title()}Panel")(self.context)
+        with panel.add_tab("Session"):
             self._session = Text(gui)
             self._path = gui.add_text(
                 "Folder", "", hint="Of another session; created if it does not exist"
@@ -117,36 +139,17 @@ class Shell(ControlGroup):
             self.button(
                 "Open session", lambda: operator.open_session(self._path.value), "folder-open"
             )
-        links = gui.add_button(
-            "Links", icon=viser.Icon.LINK, color="gray", hint="For watching and for the projector"
-        )
-        links.on_click(
-            lambda event: self.context.run(partial(show_links, self.context, event.client))
-        )
-        with gui.add_folder("Messages", expand_by_default=True):
-            self._busy = Text(gui)
+            links = gui.add_button(
+                "Links",
+                icon=viser.Icon.LINK,
+                color="gray",
+                hint="For watching and for the projector",
+            )
+            links.on_click(
+                lambda event: self.context.run(partial(show_links, self.context, event.client))
+            )
+        with panel.add_tab("Messages"):
             self._latest = Text(gui)
-
-    def _build_right(self, steps: Sequence[StepView]) -> None:
-        """Build the right panel: heading, problems, progress, and the panels of all steps."""
-        gui = self._gui
-        panel = gui.add_panel()
-        panel.dock_right()
-        panel.set_width(STEP_PX)
-        with panel.add_tab("Step", viser.Icon.HAND_FINGER):
-            Text(gui).set(_SCROLL_BAR_MARGIN)
-            self._heading = Text(gui)
-            self._progress = Text(gui)
-            self._cancel = self.button(
-                "Cancel", self._operator.cancel, "player-stop", "red", at_once=True
-            )
-            self._next = self.button(
-                "Continue", lambda: self.go(self._following_key), "arrow-right", "green"
-            )
-            self._cancel.visible = self._next.visible = False
-            for key in (step.key for step in steps):
-                module = importlib.import_module(f"slviewer.gui.steps.{key}")
-                self._panels[key] = getattr(module, f"{key.title()}Panel")(self.context)
 
     # drawing
 
@@ -157,9 +160,9 @@ class Shell(ControlGroup):
         if key != self._shown_key:
             self._switch_panel(key)
         for step in snapshot.steps:
-            colour = None if step.key == key else _STEP_COLOURS[step.state]
             button = self._step_buttons[step.key]
-            button.icon, button.color = viser.IconName(_ICONS[step.state]), colour
+            button.icon = viser.IconName(_ICONS[step.state])
+            button.color = None if step.key == key else _STEP_COLOURS[step.state]
         self._draw_heading(snapshot)
         self._draw_progress(snapshot)
         self._draw_session(snapshot)
@@ -239,8 +242,7 @@ class Shell(ControlGroup):
         job = snapshot.job
         can_cancel = snapshot.rig.capture is not None or bool(job and job.can_cancel)
         self._cancel.visible = bool(work) and can_cancel
-        # repeated beside every step: it must not scroll out of view, nor move what is about to be
-        # clicked
+        # repeated on the left: it must not scroll out of view, nor move what is about to be clicked
         self._busy.set(progress or note(f"{job.stage or job.name} …" if job else "Idle"))
 
     def _draw_session(self, snapshot: Snapshot) -> None:
@@ -249,31 +251,31 @@ class Shell(ControlGroup):
         session, space = snapshot.session, snapshot.space
         if session is None:
             about = alert("No session is open: enter a folder.", "warning")
+            self._counts.set(note("No session is open.", "warning"))
         else:
             counts = (
                 format_count(len(session.poses), "pose"),
                 format_count(len(session.scans), "scan"),
             )
-            lines = [
-                f"<b>{to_html(session.folder.name)}</b>",
-                f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}</span>',
-                ", ".join(counts),
-            ]
+            name = f'<b style="overflow-wrap:anywhere">{to_html(session.folder.name)}</b>'
+            lines = [name, ", ".join(counts)]
+            self._counts.set(paragraph(Html("<br>".join(lines))))
+            folder = f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}'
+            lines.insert(1, f"{folder}</span>")
             if space:
                 text = f"{format_bytes(space.free_bytes)} free"
                 if space.capture_bytes:
                     text += f"; a capture needs {format_bytes(space.capture_bytes)}"
                 lines.append(coloured(text, "dim" if space.enough else "error"))
             about = paragraph(Html("<br>".join(lines)))
+        self._session.set(about)
         faults = (session or NO_SESSION).faults
         more = len(faults) - _MOST_FAULTS
         rest = f"{more} more files are damaged: `slviewer inspect` lists them." if more > 0 else ""
-        for text in (snapshot.read_failure, *faults[:_MOST_FAULTS], rest):
-            about += alert(text, "error")
-        self._session.set(about)
+        texts = (snapshot.read_failure, *faults[:_MOST_FAULTS], rest)
+        self._faults.set("".join(alert(text, "error") for text in texts))
         self._autopilot.visible = snapshot.rig.simulated
         self._autopilot.label = "Stop autopilot" if snapshot.autopilot else "Autopilot"
-        self._autopilot.color = "red" if snapshot.autopilot else "teal"
         self._autopilot_status.write(snapshot.autopilot, "info")
         latest = ""
         for notice in reversed(snapshot.notices[-_MOST_NOTICES:]):
@@ -281,8 +283,7 @@ class Shell(ControlGroup):
             text = coloured(notice.text, NOTICES[notice.level][3])
             link = f" {help_link(notice.section)}" if notice.section else ""
             latest += paragraph(Html(f"{time} {text}{link}"))
-        # as high as a small screen leaves, so that the panel itself does not scroll
-        style = "max-height:max(6em, calc(100vh - 665px));overflow-y:auto;overflow-wrap:anywhere"
+        style = "padding-top:0.6em;overflow-wrap:anywhere"
         self._latest.set(f'<div style="{style}">{latest or note("No messages.")}</div>')
 
     def _draw_devices(self, calibration: CalibrationView | None, devices: RigView) -> None:
@@ -420,7 +421,7 @@ def _link_html(what: str, link: str, qr_code: bool) -> Html:
     style = (
         "display:block;user-select:all;overflow-wrap:anywhere;padding:0.4em"
         " 0.6em;border-radius:4px;"
-        "background:var(--mantine-color-gray-1);font-family:monospace;font-size:0.9em;flex:1"
+        "background:var(--mantine-color-gray-light);font-family:monospace;font-size:0.9em;flex:1"
     )
     code = f"<code style='{style}'>{html.escape(link)}</code>"
     if qr_code:

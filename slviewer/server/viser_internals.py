@@ -41,6 +41,8 @@ Message = _messages.Message
 CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
 PAGE_SCRIPT = resources.files("slviewer.server").joinpath("page_script.js").read_bytes()
 """Our script, which runs in viser's page before its own."""
+PAGE_STYLE = resources.files("slviewer.server").joinpath("page_style.css").read_bytes()
+"""Our style of viser's page."""
 
 FROM_CLIENTS: dict[str, type[Any]] = {
     name: getattr(_messages, name)
@@ -104,9 +106,10 @@ def check_version() -> None:
 
 
 def client_page() -> bytes:
-    """The page that viser serves, with our script in it."""
+    """The page that viser serves, with our style and script in it."""
     before, loader, after = CLIENT_PAGE.read_bytes().partition(b"<script data-p=")
-    return b"".join([before, b"<script>", PAGE_SCRIPT, b"</script>", loader, after])
+    style = b"<style>" + PAGE_STYLE + b"</style>"
+    return b"".join([before, style, b"<script>", PAGE_SCRIPT, b"</script>", loader, after])
 
 
 def stop(server: viser.ViserServer) -> None:

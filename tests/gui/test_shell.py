@@ -13,12 +13,14 @@ from wizard_page import (
     CALM,
     PATIENCE_S,
     RIG,
+    SIZE,
     Opened,
     button,
     choose,
     click,
     field,
     new_page,
+    open_tab,
     wait_until,
 )
 
@@ -79,6 +81,27 @@ def test_guest_sees_same_step_and_changes_nothing(
     click(opened.page, "Use this board")
     expect(guest.get_by_text("In use: circles:21x16:9")).to_be_visible()
     assert app.shell.current == "target"
+
+
+def test_view_keeps_most_of_the_page_in_the_theme_of_the_system(opened: Opened) -> None:
+    page = opened.page
+    scene = page.locator("canvas").first
+
+    def share_of_view() -> float:
+        """Return the share of the page's width that the 3D view has."""
+        box = scene.bounding_box()
+        assert box is not None
+        return box["width"] / SIZE["width"]
+
+    assert 0.6 <= share_of_view() < 0.7
+    for scheme in ("dark", "light"):
+        page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        page.locator(f"html[data-mantine-color-scheme={scheme}]").wait_for()
+    fold = page.get_by_role("button", name="Collapse").last
+    fold.click()
+    wait_until(page, lambda: share_of_view() > 0.8)
+    page.get_by_role("button", name="Expand").first.click()
+    wait_until(page, lambda: share_of_view() < 0.7)
 
 
 def test_refused_rig_leaves_the_one_in_use(opened: Opened, app: App, tmp_path: Path) -> None:
@@ -164,8 +187,10 @@ def test_browser_opens_one_time_link_from_private_file(
 def test_invalid_session_folder_is_reported(opened: Opened, tmp_path: Path) -> None:
     (tmp_path / "a file").write_text("not a session")
     page = opened.page
+    open_tab(page, "Session")
     opened.enter("Folder", str(tmp_path / "a file"))
     click(page, "Open session")
+    open_tab(page, "Step")
     expect(
         page.get_by_role("alert").filter(has_text="Error").filter(has_text="a file").first
     ).to_be_visible()
@@ -227,6 +252,7 @@ def test_new_links_invalidate_old_ones(opened: Opened, shared_guest: Opened, app
     page, old = opened.page, app.server.link("watch")
     guest = shared_guest.page
     expect(guest.get_by_text("View only")).to_be_visible()
+    open_tab(page, "Session")
     click(page, "Links")
     expect(page.get_by_text(old)).to_be_visible()
     assert old not in guest.content()

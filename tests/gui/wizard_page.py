@@ -113,6 +113,11 @@ def button(page: Page, name: str) -> Locator:
     return page.get_by_role("button", name=name)
 
 
+def open_tab(page: Page, name: str) -> None:
+    """Show another tab of the panel: Step, Session or Messages."""
+    page.get_by_role("tab", name=name).click()
+
+
 STILL = """quiet => new Promise(done => {
   const end = () => { watcher.disconnect(); done(); };
   let timer = setTimeout(end, quiet);
