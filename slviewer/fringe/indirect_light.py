@@ -12,7 +12,6 @@ nearly all of the image is like that, by nothing.
 """
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from slviewer.fringe.decoding_task import DecodingTask
 from slviewer.fringe.phase import Reason
@@ -25,6 +24,7 @@ BIT_SHARE = 0.65
 """Difference between the contrasts of a pixel's bits, as a share of the largest, up to which no bit
 is misread: that takes as much indirect light as direct. Adhesive tape on a board differs by up to a
 half, and is measured well."""
+UNSEEN = np.float32(1e9)
 BIT_SIGMAS = 8.0
 """... and in standard deviations of a grey level: noise alone does not make such a range."""
 EDGE_CELLS = 0.4
@@ -45,6 +45,7 @@ NARROW = 2.0
 WINDOW_PX = 7
 """Side of the window in which fringes and white light are averaged: one pixel's noise is no
 evidence."""
+REACH = WINDOW_PX // 2
 SAMPLES = 6000
 """Pixels, evenly spread, that the strength of the image's fringes is fitted to."""
 FEWEST = 200
@@ -53,6 +54,8 @@ UPPER = 0.95
 PENALTIES = (0.0, 0.1, 0.1, 0.1, 0.02, 0.1)
 """Of the fit's terms, in shares of the samples' weight; the phase's square alone follows the blur
 of a deep surface."""
+CONVERGED = 1e-4
+"""Change of the strengths that the fit expects, from which on it is not iterated."""
 NOISE_SIGMAS = 4.0
 """Standard deviations of their noise by which fringes must be weaker as well."""
 SPREADS = 1.0
@@ -78,7 +81,8 @@ def mask_indirect_light(task: DecodingTask, maps: Maps) -> None:
         if frame.kind == kind
     ]
     if layout.steps >= FEWEST_STEPS and whites:
-        reason[_detect_weak_fringes(task, task.stack[whites[0]], maps)] = Reason.INDIRECT
+        weak = _detect_weak_fringes(task, task.stack[whites[0]], maps)
+        reason.reshape(-1)[weak] = Reason.INDIRECT
     if layout.gray:
         _mask_unequal_bits(task, maps)
     phase[reason == Reason.INDIRECT] = np.nan
@@ -120,114 +124,298 @@ def _mask_unequal_bits(task: DecodingTask, maps: Maps) -> None:
 def _compare_bits(stack, first, frames, inverses, spans, limits, phase, background, reason):
     """Set the reason INDIRECT in rows from ``first`` on; the three maps contain only these rows."""
     to_px, origin, guard, noise_a, noise_b = limits
+    width = phase.shape[1]
+    place, heights = np.empty(width, np.float32), np.empty(width, np.float32)
+    ranges = (
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+    )
     for i in range(len(phase)):
-        for x in range(phase.shape[1]):
-            if reason[i, x] != 0:
-                continue
-            place, level = phase[i, x] * to_px - origin, background[i, x]
-            most_white, least_white, most_black, least_black = 0.0, 1e9, 0.0, 1e9
-            for b in range(len(frames)):
-                turns = place / spans[b]
-                if abs(turns - np.floor(turns) - 0.5) * spans[b] < guard:
-                    continue
-                value = np.float64(stack[frames[b], first + i, x])
-                if inverses[b] >= 0:
-                    height = abs(value - np.float64(stack[inverses[b], first + i, x])) / 2
-                else:
-                    height = value - level
-                if height > 0:
-                    most_white, least_white = max(most_white, height), min(least_white, height)
-                else:
-                    most_black, least_black = max(most_black, -height), min(least_black, -height)
-            swing = max(most_white, most_black)
-            sigma = np.sqrt(max(noise_a + noise_b * (level + most_white), 0.0))
-            if max(most_white - least_white, most_black - least_black) > max(
-                BIT_SHARE * swing, BIT_SIGMAS * sigma
-            ):
-                reason[i, x] = INDIRECT
+        ranges[0][:], ranges[1][:], ranges[2][:], ranges[3][:] = 0, UNSEEN, 0, UNSEEN
+        for x in range(width):
+            place[x] = phase[i, x] * np.float32(to_px) - np.float32(origin)
+        for b in range(len(frames)):
+            frame, inverse = stack[frames[b], first + i], stack[max(inverses[b], 0), first + i]
+            _measure_heights(frame, inverse, inverses[b] >= 0, background[i], heights)
+            _extend_ranges(place, heights, np.float32(spans[b]), np.float32(guard), ranges)
+        _mask_ranges(background[i], noise_a, noise_b, ranges, reason[i])
+
+
+@kernel()
+def _measure_heights(frame, inverse, has_inverse, background, heights):
+    """Fill ``heights`` (w,): levels of a bit above black and white's mean, which the inverse, if
+    there is one, or the background shows."""
+    if has_inverse:
+        for x in range(len(heights)):
+            heights[x] = abs(np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
+    else:
+        for x in range(len(heights)):
+            heights[x] = np.float32(frame[x]) - background[x]
+
+
+@kernel()
+def _extend_ranges(place, heights, span, guard, ranges):
+    """Extend the ranges of a row's levels, most and least of white and of black, by those of a bit
+    of this ``span``, px, that are farther than ``guard`` from its edges."""
+    most_white, least_white, most_black, least_black = ranges
+    per_span, none = np.float32(1) / span, np.float32(0)
+    for x in range(len(place)):
+        turns = place[x] * per_span
+        is_far = abs(turns - np.floor(turns) - np.float32(0.5)) * span >= guard
+        height = heights[x]
+        white = height if is_far & (height > none) else none
+        black = -height if is_far & (height <= none) else none
+        some_white = white if white > none else UNSEEN
+        some_black = black if is_far & (height <= none) else UNSEEN
+        # all are read before one is written: else the compiler takes them one by one
+        a, b, c, d = most_white[x], least_white[x], most_black[x], least_black[x]
+        most_white[x] = white if white > a else a
+        least_white[x] = some_white if some_white < b else b
+        most_black[x] = black if black > c else c
+        least_black[x] = some_black if some_black < d else d
+
+
+@kernel()
+def _mask_ranges(background, noise_a, noise_b, ranges, reason):
+    """Set the reason INDIRECT where a row's levels, most and least of white and of black, range
+    over more than shares and noise allow."""
+    most_white, least_white, most_black, least_black = ranges
+    a, b = np.float32(noise_a), np.float32(noise_b)
+    share, sigmas = np.float32(BIT_SHARE), np.float32(BIT_SIGMAS)
+    for x in range(len(reason)):
+        white, black = most_white[x], most_black[x]
+        spread = max(white - least_white[x], black - least_black[x])
+        variance = max(a + b * (background[x] + white), np.float32(0))
+        is_unequal = (spread > share * max(white, black)) & (spread > sigmas * np.sqrt(variance))
+        reason[x] = INDIRECT if is_unequal & (reason[x] == 0) else reason[x]
 
 
 def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps) -> np.ndarray:
-    """Return (h, w) bool: valid pixels whose fringes are weak for their white light, compared with
-    the image's.
+    """Return indices of the pixels (flattened) whose fringes are weak for their white light,
+    compared with the image's.
 
     Of sharp fringes the amplitude is half of the white light. Blur makes them weaker: the
     projector's, which changes evenly over a depth range, and the camera's, by the square of the
-    phase's gradient. Both are fitted.
+    phase's gradient. Both are fitted to a sample; only then is every pixel compared.
     """
-    layout, noise, (phase, _, modulation, background, reason) = task.layout, task.noise, maps
-    nothing = np.zeros(phase.shape, bool)
+    layout = task.layout
     is_narrow = (
         not layout.gray
         and len(layout.shifts) > 1
         and layout.shifts[0].period_px < NARROW * layout.period_px
     )
     share = WEAK_NARROW if is_narrow else WEAK
-    valid = (reason == Reason.VALID) & (white_frame < task.white) & (white_frame > background)
-    if np.count_nonzero(valid) < FEWEST:
-        return nothing
-    weight = valid.astype(np.float32)
-    half = uniform_filter(
-        np.where(valid, white_frame - background, 0).astype(np.float32), WINDOW_PX
-    )
-    fringes = uniform_filter(modulation * weight, WINDOW_PX)
-    count = WINDOW_PX**2 * uniform_filter(weight, WINDOW_PX)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        strength = np.where(valid, np.log(fringes / half), np.nan)
-        # Mostly of the white frame; the fringes are of several frames.
-        own = np.sqrt(
-            np.maximum(noise[0] + noise[1] * (background + half / np.maximum(weight, 0.1)), 0)
-        )
-        margin = NOISE_SIGMAS * own * np.sqrt(count) / (half * WINDOW_PX**2) - np.log(1 - share)
-    slope = _square_gradient(phase, valid)
-    rows, columns = np.nonzero(valid & np.isfinite(strength) & np.isfinite(slope))
-    if len(rows) < FEWEST:
-        return nothing
-    some = np.s_[:: max(1, len(rows) // SAMPLES)]
-    at = rows[some], columns[some]
-    terms = _model_terms(phase, slope, *at)
-    fit, spread = _fit_strength(strength[at], terms)
+    arrays = tuple(read_only(each) for each in (white_frame, *maps[:1], *maps[2:]))
+    limits = np.array([task.white, *task.noise])
+    sampled = _sample_strength(arrays, limits)
+    if len(sampled) < FEWEST:
+        return np.zeros(0, np.int64)
+    strength, terms = sampled[:, 0], sampled[:, 2:]
+    fit, spread = _fit_strength(strength, terms)
     typical = float(np.exp(np.median(terms @ fit)))
     if not PLAUSIBLE[0] < typical < PLAUSIBLE[1] or spread > MOST_SPREAD:
-        return nothing
+        return np.zeros(0, np.int64)
+    margin = SPREADS * spread - np.log(1 - share)
     if is_narrow:
         # narrow fringes: the more unsharp they are, the more blur varies
-        margin = margin - min(np.log(typical), 0.0)
-    expected = np.full(phase.shape, np.inf)
-    expected[rows, columns] = _model_terms(phase, slope, rows, columns) @ fit
-    with np.errstate(invalid="ignore"):
-        return np.asarray(
-            valid & np.isfinite(expected) & (strength < expected - margin - SPREADS * spread)
-        )
+        margin -= min(np.log(typical), 0.0)
+    weak, counts = np.empty(white_frame.shape, bool), np.empty(len(white_frame), np.int64)
+    run_rows(_select_candidates, len(weak), arrays, task.white, fit, margin, weak, counts)
+    if not counts.any():
+        return np.zeros(0, np.int64)
+    run_rows(_confirm_candidates, len(weak), arrays, limits, fit, margin, weak, counts)
+    return np.flatnonzero(weak)
 
 
-def _model_terms(
-    phase: np.ndarray, slope: np.ndarray, rows: np.ndarray, columns: np.ndarray
-) -> np.ndarray:
-    """Return (n, 6): what the strength of fringes is linear in, of pixels at ``rows`` and
-    ``columns``.
+def _sample_strength(arrays: Maps, limits: np.ndarray) -> np.ndarray:
+    """Return `_measure_strength` (n, 8) of evenly spread pixels where it is known, on a grid that
+    is finer where few are."""
+    height, width = arrays[0].shape
+    step = max(1, int(np.sqrt(height * width / SAMPLES)))
+    while True:
+        rows, columns = (np.arange(step // 2, size, step) for size in (height, width))
+        out = np.empty((len(rows), len(columns), 2 + len(PENALTIES)))
+        _measure_samples(arrays, limits, rows, columns, out)
+        out = out[np.isfinite(out[..., 0])]
+        if len(out) >= SAMPLES / 8 or step == 1:
+            return out
+        step //= 2
 
-    A constant, the place in the image and the phase, which together follow the depth, the phase's
-    square, as blur grows by the square of the distance from focus, and the squared gradient.
-    """
+
+@kernel()
+def _reflect(i, size):
+    """Return the row or column that stands for one beside the image of this size."""
+    return -1 - i if i < 0 else 2 * size - 1 - i if i >= size else i
+
+
+@kernel()
+def _measure_light(arrays, white, i, x):
+    """Return half of the white light of a pixel, in grey levels; 0 where it is unknown."""
+    white_frame, _, _, background, reason = arrays
+    light = np.float32(white_frame[i, x]) - background[i, x]
+    is_known = reason[i, x] == 0 and white_frame[i, x] < white and light > 0
+    return light if is_known else np.float32(0)
+
+
+@kernel()
+def _measure_square_gradient(phase, i, x):
+    """Return the square of the phase's gradient, (rad / px)^2; NaN at a depth step, and where it is
+    unknown."""
     height, width = phase.shape
-    scaled = phase[rows, columns] / 100.0
-    place = [columns / width, rows / height, scaled, scaled**2]
-    return np.stack([np.ones(len(rows)), *place, slope[rows, columns]], axis=1).astype(np.float64)
+    if i == 0 or x == 0 or i == height - 1 or x == width - 1:
+        return np.nan
+    along_row = np.float64(phase[i, x + 1] - phase[i, x - 1])
+    along_column = np.float64(phase[i + 1, x] - phase[i - 1, x])
+    square = (along_row**2 + along_column**2) / 4
+    return square if square < STEEPEST else np.nan
 
 
-def _square_gradient(phase: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the square of the phase's gradient (h, w), (rad / px)^2; beside masked pixels that of
-    the neighbours."""
-    out = np.full(phase.shape, np.nan, np.float32)
-    inner = phase[1:-1, 2:] - phase[1:-1, :-2], phase[2:, 1:-1] - phase[:-2, 1:-1]
-    out[1:-1, 1:-1] = (inner[0] ** 2 + inner[1] ** 2) / 4
-    known = np.isfinite(out) & (out < STEEPEST)  # else a depth step
-    share = uniform_filter(known.astype(np.float32), WINDOW_PX)
-    mean = uniform_filter(np.where(known, out, 0).astype(np.float32), WINDOW_PX) / np.maximum(
-        share, 1e-3
-    )
-    return np.where(known, out, mean)
+@kernel()
+def _measure_strength(arrays, limits, i, x, out):
+    """Fill ``out`` (8,) of a pixel: strength of the fringes, four of its standard deviations, and
+    the terms that the strength is modelled by. The strength is NaN where it is unknown.
+
+    Strength: log of the fringes' amplitude over half of the white light, both averaged over a
+    window. Terms: a constant, the place in the image and the phase, which together follow the
+    depth, the phase's square, as blur grows by the square of the distance from focus, and the
+    squared gradient, beside depth steps that of the neighbours.
+    """
+    _, phase, modulation, background, _ = arrays
+    white, noise_a, noise_b = limits
+    height, width = phase.shape
+    out[0] = np.nan
+    if _measure_light(arrays, white, i, x) == 0:
+        return
+    half, fringes, count, slope, slopes = 0.0, 0.0, 0, 0.0, 0
+    own_slope = _measure_square_gradient(phase, i, x)
+    for row in range(i - REACH, i + REACH + 1):
+        v = _reflect(row, height)
+        for column in range(x - REACH, x + REACH + 1):
+            u = _reflect(column, width)
+            light = _measure_light(arrays, white, v, u)
+            if light > 0:
+                half, fringes, count = half + light, fringes + modulation[v, u], count + 1
+            if np.isnan(own_slope):
+                square = _measure_square_gradient(phase, v, u)
+                if not np.isnan(square):
+                    slope, slopes = slope + square, slopes + 1
+    # Mostly of the white frame; the fringes are of several frames.
+    level = background[i, x] + half / WINDOW_PX**2
+    noise = np.sqrt(max(noise_a + noise_b * level, 0.0))
+    out[0] = np.log(fringes / half) if fringes > 0 else np.nan
+    out[1] = NOISE_SIGMAS * noise * np.sqrt(count) / half
+    scaled = phase[i, x] / 100.0
+    out[2], out[3], out[4] = 1.0, x / width, i / height
+    out[5], out[6] = scaled, scaled**2
+    out[7] = slope / max(slopes, 1) if np.isnan(own_slope) else own_slope
+
+
+@kernel()
+def _measure_samples(arrays, limits, rows, columns, out):
+    """Fill ``out`` (len(rows), len(columns), 8) as `_measure_strength` does."""
+    for k in range(len(rows)):
+        for j in range(len(columns)):
+            _measure_strength(arrays, limits, rows[k], columns[j], out[k, j])
+
+
+@kernel()
+def _select_candidates(first, last, arrays, white, fit, margin, candidates, counts):
+    """Set ``candidates`` (h, w) and their ``counts`` (h,) in a range of rows: where the fringes may
+    be weaker by the margin than the strongest that the fitted terms (6,) expect in a row.
+
+    Sums over windows follow from those of the row before.
+    """
+    white_frame, phase, modulation, background, reason = arrays
+    height, width = phase.shape
+    fringes = np.zeros((WINDOW_PX, width), np.float32)
+    light = np.zeros((WINDOW_PX, width), np.float32)
+    sums = np.zeros(width + 2 * REACH, np.float32), np.zeros(width + 2 * REACH, np.float32)
+    inner = sums[0][REACH:-REACH], sums[1][REACH:-REACH]
+    for row in range(first - REACH, last + REACH):
+        v, slot = _reflect(row, height), (row + REACH) % WINDOW_PX
+        frames = white_frame[v], modulation[v], background[v], reason[v]
+        _replace_row(frames, np.float32(white), fringes[slot], light[slot], *inner)
+        i = row - REACH
+        if i < first:
+            continue
+        for each in sums:
+            for k in range(REACH):
+                each[REACH - 1 - k] = each[REACH + k]
+                each[k - REACH] = each[-1 - k - REACH]
+        strongest = _bound_strength(fit, i / height, phase[i])
+        limit = np.float32(1.001 * np.exp(strongest - margin))
+        own = light[(i + REACH) % WINDOW_PX]
+        counts[i] = _compare_windows(*sums, limit, own, candidates[i])
+
+
+@kernel()
+def _confirm_candidates(first, last, arrays, limits, fit, margin, candidates, counts):
+    """Reset the ``candidates`` in a range of rows whose fringes are not weaker than the fitted
+    terms expect there by the margin and their noise."""
+    measured = np.empty(2 + len(fit))
+    for i in range(first, last):
+        if counts[i] == 0:
+            continue
+        for x in np.flatnonzero(candidates[i]):
+            _measure_strength(arrays, limits, i, x, measured)
+            expected = 0.0
+            for k in range(len(fit)):
+                expected += fit[k] * measured[2 + k]
+            candidates[i, x] = measured[0] < expected - margin - measured[1]
+
+
+@kernel()
+def _replace_row(frames, white, fringes, light, fringe_sums, light_sums):
+    """Replace a row's amplitudes and white light, (w,) each, in themselves and in their sums.
+
+    ``frames``: the row's white light, modulation, background and reason.
+    """
+    white_frame, modulation, background, reason = frames
+    for x in range(len(modulation)):
+        level = np.float32(white_frame[x])
+        half = level - background[x]
+        is_known = (reason[x] == 0) & (level < white) & (half > np.float32(0))
+        amplitude = modulation[x] if is_known else np.float32(0)
+        half = half if is_known else np.float32(0)
+        fringe_sums[x] += amplitude - fringes[x]
+        light_sums[x] += half - light[x]
+        fringes[x], light[x] = amplitude, half
+
+
+@kernel()
+def _compare_windows(fringes, light, limit, own, is_less):
+    """Set ``is_less`` (w,): where there is light of its ``own``, and the fringes in the window are
+    less than ``limit`` times its light; return the count. Both (w + 6,) are summed along columns.
+    """
+    count = 0
+    for x in range(len(is_less)):
+        weak, strong = fringes[x], light[x]
+        for k in range(1, WINDOW_PX):
+            weak += fringes[x + k]
+            strong += light[x + k]
+        is_less[x] = (own[x] > np.float32(0)) & (weak < limit * strong)
+        count += is_less[x]
+    return count
+
+
+@kernel()
+def _bound_strength(fit, place, phase):
+    """Return the largest strength that the fitted terms (6,) give in a row (w,) at this place, 0 to
+    1 in the image."""
+    low, high = np.float32(np.inf), np.float32(-np.inf)
+    for value in phase:
+        low = value if value < low else low
+        high = value if value > high else high
+    if not low <= high:
+        return -np.inf
+    a, b = low / 100.0, high / 100.0
+    most = max(a * (fit[3] + a * fit[4]), b * (fit[3] + b * fit[4]))
+    if fit[4] < 0:
+        top = min(max(-fit[3] / (2 * fit[4]), a), b)
+        most = max(most, top * (fit[3] + top * fit[4]))
+    return fit[0] + max(fit[1], 0.0) + place * fit[2] + most
 
 
 def _fit_strength(strength: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, float]:
@@ -241,14 +429,16 @@ def _fit_strength(strength: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, 
     middle, size = terms.mean(axis=0), np.maximum(terms.std(axis=0), 1e-9)
     middle[0], size[0] = 0.0, 1.0
     terms = (terms - middle) / size
-    weight = np.ones(len(terms))
+    weight, rest = np.ones(len(terms)), strength
     for _ in range(20):
         penalty = np.diag(PENALTIES) * weight.sum()
         normal, moment = (terms.T * weight) @ terms + penalty, (terms.T * weight) @ strength
         fit = np.linalg.solve(normal, moment)
         if fit[-1] > 0:
             fit = np.append(np.linalg.solve(normal[:-1, :-1], moment[:-1]), 0.0)
-        rest = strength - terms @ fit
+        before, rest = rest, strength - terms @ fit
+        if np.abs(rest - before).max() < CONVERGED:
+            break
         weight = np.where(rest > 0, UPPER, 1 - UPPER) / np.maximum(np.abs(rest), 0.005)
     above = rest > 0
     slopes = fit / size

@@ -6,8 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 from fringe_scene import variants
+from scipy.ndimage import uniform_filter
 
+from slviewer.fringe import indirect_light
 from slviewer.fringe.decode import decode, decode_reference
+from slviewer.fringe.decoding_task import prepare_decoding
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
 from slviewer.fringe.sequence import one_axis
@@ -81,3 +84,45 @@ def test_the_definition_masks_the_same_pixels():
     sequence, frames = captured(MISLED, p18)
     ours, reference = decode(sequence, frames, "x"), decode_reference(sequence, frames, "x")
     assert np.mean((ours.reason == Reason.INDIRECT) != (reference.reason == Reason.INDIRECT)) < 1e-3
+
+
+def test_windows_are_those_of_filters_of_the_whole_image():
+    rng = np.random.default_rng(0)
+    size = 40, 60
+    white = rng.integers(100, 250, size, np.uint8)
+    phase, amplitude = rng.uniform(0, 2, (2, *size)).astype(np.float32)
+    background = rng.uniform(50, 120, size).astype(np.float32)
+    reason = (rng.random(size) < 0.2).astype(np.uint8)
+    measured = np.empty((*size, 8))
+    arrays = white, phase, amplitude, background, reason
+    limits = np.array([240.0, 2.0, 0.1])
+    indirect_light._measure_samples(arrays, limits, np.arange(40), np.arange(60), measured)
+    valid = (reason == 0) & (white < 240) & (white > background)
+    light = uniform_filter(np.where(valid, white - background.astype(float), 0), 7)
+    strength = np.log(uniform_filter(np.where(valid, amplitude.astype(float), 0), 7) / light)
+    assert np.array_equal(np.isfinite(measured[..., 0]), valid)
+    assert np.abs(measured[..., 0] - strength)[valid].max() < 1e-5
+    count = 49 * uniform_filter(valid.astype(float), 7)
+    sigma = np.sqrt(2 + 0.1 * (background + light)) * np.sqrt(count) / (49 * light)
+    assert np.abs(measured[..., 1] / (4 * sigma) - 1)[valid].max() < 1e-5
+    along = np.gradient(phase.astype(float))
+    square = (along[0] ** 2 + along[1] ** 2)[1:-1, 1:-1]
+    assert np.abs(measured[1:-1, 1:-1, 7] - square)[valid[1:-1, 1:-1]].max() < 1e-4
+
+
+def test_no_weak_fringes_are_lost_by_the_selection_of_candidates():
+    sequence, frames = captured(MISLED, p18)
+    task = prepare_decoding(sequence, frames, "x")
+    plain = decode(sequence, frames, "x", mask_indirect=False)
+    maps = plain.phase, plain.wrapped, plain.modulation, plain.background, plain.reason
+    weak = indirect_light._detect_weak_fringes(task, frames[-1], maps)
+    assert sequence.frames[-1].kind == "texture"
+    arrays, limits = (frames[-1], maps[0], *maps[2:]), np.array([task.white, *task.noise])
+    sampled = indirect_light._sample_strength(arrays, limits)
+    fit, spread = indirect_light._fit_strength(sampled[:, 0], sampled[:, 2:])
+    everywhere = np.empty((*frames.shape[1:], 8))
+    indirect_light._measure_samples(arrays, limits, *map(np.arange, frames.shape[1:]), everywhere)
+    margin = spread - np.log(1 - indirect_light.WEAK) + everywhere[..., 1]
+    expected = np.flatnonzero(everywhere[..., 0] < everywhere[..., 2:] @ fit - margin)
+    assert len(expected) > 1000
+    assert np.array_equal(weak, expected)
