@@ -66,7 +66,7 @@ class PanelContext:
     ) -> None:
         self.operator, self.server, self.pages = operator, server, pages
         self.print_links = print_links
-        self.gui, self.scene = server.viser.gui, ViewerScene(server.viser.scene, self.submit)
+        self.gui, self.scene = server.viser.gui, ViewerScene(server.viser, self.submit)
         self.viewpoints = Viewpoints(server.viser)
         self._pass_on = start_worker("slviewer requests")
         self.lock = threading.RLock()

@@ -3,19 +3,19 @@ and the region of interest, a box that is moved and turned by a handle."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.render import format_count
 from slviewer.gui.panel import PanelPart, StepPanel
-from slviewer.gui.scene import Click
+from slviewer.gui.scene import Click, Drag, DragShape
 from slviewer.gui.widgets import Text, note
 from slviewer.pipeline.edit import SUPPORT, Selection
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import (
     SupportPlane,
-    ViewCamera,
+    select_along_path,
     select_connected,
     select_in_outline,
     select_support,
@@ -23,17 +23,23 @@ from slviewer.surface.selection import (
 from slviewer.wizard.result_views import ScanCloud
 from slviewer.wizard.snapshot import ScanView
 
-OFF, RECTANGLE, LASSO, PART = "off", "rectangle", "lasso", "connected part"
+OFF, BRUSH, PART = "off", "brush", "connected part"
+_DRAGS: dict[str, DragShape] = {"rectangle": "rectangle", "lasso": "lasso", BRUSH: "brush"}
+_DRAG_HINT = (
+    " All points inside are added, also hidden ones behind; with Shift they are taken away. Ctrl"
+    " and drag turns the view, the right button moves it."
+)
 _HINTS = {
     OFF: "",
-    RECTANGLE: "Drag a rectangle over the points. To turn the view, choose “off”.",
-    LASSO: "Click around the points, then Close outline.",
+    "rectangle": "Drag a rectangle over the points." + _DRAG_HINT,
+    "lasso": "Drag a line around the points, and release." + _DRAG_HINT,
+    BRUSH: "Drag over the points." + _DRAG_HINT,
     PART: "Click a part of the surface.",
 }
 SELECTED = (225, 40, 120)
 SHOWN_EDITS = 6
 """The last ones are listed; the report lists all."""
-_SELECTION, _OUTLINE = "selection", "outline"
+_SELECTION = "selection"
 REGION_ON, REGION_OFF = (20, 150, 140), (150, 150, 150)
 _BOX, _HANDLE = "region", "region handle"
 _HANDLE_SHARE = 0.6
@@ -82,7 +88,6 @@ class PointEditing(PanelPart):
         self._changed, self._pick = changed, pick
         self._scans: list[_EditedScan] = []
         self._what: list[str] = []
-        self._outline: list[Click] = []
         self._visible = False
         super().__init__(panel)
 
@@ -91,9 +96,12 @@ class PointEditing(PanelPart):
         gui, operator = self._gui, self._operator
         with gui.add_folder("Edit points", expand_by_default=False) as self._folder:
             self._mode = self.dropdown("Select by", _HINTS, do=self._change_mode)
+            self._size: Any = gui.add_slider(
+                "Brush (%)", 1, 30, 1, 6, hint="Its diameter, in % of the view's height"
+            )
+            self._size.visible = False
+            self.react(self._size.on_update, self._listen)
             self._hint = Text(gui)
-            self._close = self.button("Close outline", self._close_outline, "polygon", None)
-            self._close.visible = False
             self.button(
                 "Select support", self._select_support, "table",
                 hint="The plane that the object stands on, and all below it",
@@ -181,20 +189,12 @@ class PointEditing(PanelPart):
         self._draw_selection()
 
     def _clear_selection(self) -> None:
-        """Select nothing, and forget the outline."""
+        """Select nothing."""
         for scan in self._scans:
             scan.selected = np.zeros_like(scan.selected)
             scan.plane = None
         self._what = []
-        self._forget_outline()
         self._draw_selection()
-
-    def _forget_outline(self) -> None:
-        """Forget the corners of the outline."""
-        self._outline = []
-        self._layer.remove(_OUTLINE)
-        self._hint.write(_HINTS[self._mode.value], "dim")
-        self._close.visible = False
 
     def _draw_selection(self) -> None:
         """Draw the selected points over the others."""
@@ -223,14 +223,15 @@ class PointEditing(PanelPart):
     def _change_mode(self) -> None:
         """Take the clicks or drags that the way of selecting needs, then show its hint."""
         self._listen()
-        self._forget_outline()
+        self._size.visible = self._mode.value == BRUSH
+        self._hint.write(_HINTS[self._mode.value], "dim")
 
     def _listen(self) -> None:
         """Take the clicks or drags that the way of selecting needs, else leave them."""
         mode = self._mode.value if self._visible else ""
-        self._scene.on_rectangle(self._take_rectangle if mode == RECTANGLE else None)
-        clicks = {OFF: self._pick, LASSO: self._take_corner, PART: self._select_part}
-        self._scene.on_click(clicks.get(mode))
+        shape = _DRAGS.get(mode, "")
+        self._scene.on_drag(shape, self._take_drag if shape else None, self._size.value / 100)
+        self._scene.on_click({OFF: self._pick, PART: self._select_part}.get(mode))
 
     def _select_part(self, click: Click) -> None:
         """Select the part that a click meets."""
@@ -242,43 +243,21 @@ class PointEditing(PanelPart):
             masks[i] = select_connected(clouds[i], (u, v))
             self._add(masks, PART)
 
-    def _select_outline(self, view: ViewCamera, corners: np.ndarray, what: str) -> None:
-        """Select what an outline (n, 2) holds in a view."""
-        self._add([select_in_outline(scan.points, view, corners) for scan in self._scans], what)
-
-    def _take_rectangle(self, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> None:
-        """Select what a rectangle, from its lowest to its highest corner (2,), holds in a view."""
-        self._select_outline(
-            view, np.array([low, [high[0], low[1]], high, [low[0], high[1]]]), RECTANGLE
-        )
-
-    def _take_corner(self, click: Click) -> None:
-        """Add a corner of the outline; begin again where the view has moved."""
-        if self._outline and not self._outline[-1].view.is_near(click.view):
-            self._forget_outline()
-            self.context.notify("info", "The view has moved: the outline begins again")
-        if not self._scans:
-            return
-        self._outline.append(click)
-        # drawn before the points, so that it stays visible
-        position, rays = click.view.position, np.array([each.direction for each in self._outline])
-        away = 0.5 * min(
-            float(np.nanmin(np.linalg.norm(scan.points - position, axis=-1)))
+    def _take_drag(self, drag: Drag) -> None:
+        """Add what a shape holds to the selection, or take it away."""
+        mode, radius = self._mode.value, self._size.value / 200
+        masks = [
+            select_along_path(scan.points, drag.view, drag.path, radius)
+            if mode == BRUSH
+            else select_in_outline(scan.points, drag.view, drag.path)
             for scan in self._scans
-        )
-        ends = position + away * rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        segments = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
-        self._layer.lines(_OUTLINE, segments, SELECTED)
-        count = format_count(len(rays), "corner")
-        self._hint.write(f"{_HINTS[LASSO]} {count} set.", "dim")
-        self._close.visible, self._close.disabled = True, len(rays) < 3
-
-    def _close_outline(self) -> None:
-        """Select what the outline holds."""
-        if self._scans and self._outline:
-            view, corners = self._outline[-1].view, np.array([c.place for c in self._outline])
-            self._forget_outline()
-            self._select_outline(view, corners, LASSO)
+        ]
+        if not drag.removes:
+            self._add(masks, mode)
+            return
+        for scan, mask in zip(self._scans, masks, strict=True):
+            scan.selected, scan.plane = scan.selected & ~mask, None
+        self._draw_selection()
 
     # the buttons
 

@@ -8,13 +8,15 @@ Every method may be called from any thread.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
 import viser.transforms as tf
 from numpy.typing import NDArray
 
+from slviewer.gui.widgets import Text
+from slviewer.server.viser_internals import listen_to_shapes
 from slviewer.surface.selection import ViewCamera
 from slviewer.wizard.result_views import nearest
 
@@ -58,6 +60,27 @@ class Click:
             if index is not None:
                 met.append((float((points[index] - self.origin) @ self.direction), i, index))
         return min(met)[1:] if met else None
+
+
+DragShape = Literal["", "rectangle", "lasso", "brush"]
+_CURSORS: dict[DragShape, str] = {
+    "rectangle": "crosshair",
+    "lasso": "url(\"data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' width='24'"
+    " height='24' fill='none' stroke='%23e1287d' stroke-width='2'%3E%3Cpath d='M2 22 5 14 16 3l5 5"
+    "L10 19z' fill='white'/%3E%3C/svg%3E\") 2 22, crosshair",
+    "brush": "none",  # the page draws a circle of its size
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Drag:
+    """A shape that was drawn into the 3D view by dragging: the browser's view, and its places (n,
+    2), from 0 at the upper left to 1: an outline, or the path of a brush. ``removes``: Shift was
+    held."""
+
+    view: ViewCamera
+    path: np.ndarray
+    removes: bool
 
 
 class SceneLayer:
@@ -265,8 +288,12 @@ class ViewerScene:
     """Viser's scene: its floor, its layers, and the clicks and drags into it, which are passed on
     by `submit(do)`."""
 
-    def __init__(self, api: viser.SceneApi, submit: Callable[[Callable[[], Any]], None]) -> None:
-        self._api, self._submit = api, submit
+    def __init__(
+        self, server: viser.ViserServer, submit: Callable[[Callable[[], Any]], None]
+    ) -> None:
+        self._api, self._submit = server.scene, submit
+        self._drawn_shape = Text(server.gui)  # read by the page's script
+        api = server.scene
         api.set_up_direction("-y")
         api.add_grid(
             "/floor",
@@ -300,19 +327,30 @@ class ViewerScene:
 
             self._api.on_click()(handle)
 
-    def on_rectangle(self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None) -> None:
-        """Call `do(view, low, high)` for each rectangle that is dragged: the browser's view, and
-        two corners, (2,) from 0 at its upper left to 1; dragging does not turn the view then. None:
-        stop."""
+    def on_drag(
+        self, shape: DragShape, do: Callable[[Drag], None] | None, size: float = 0.0
+    ) -> None:
+        """Call `do(drag)` for each shape that is dragged; dragging does not turn the view then,
+        except with Ctrl. None: stop. ``size``: diameter of a brush, a share of the view's
+        height."""
         self._api.remove_rect_select_callback()
-        if do is not None:
+        if do is None:
+            self._drawn_shape.set("")
+            return
+        self._drawn_shape.set(
+            f'<i data-draw="{shape}" data-size="{size:g}"></i>'
+            f"<style>canvas[data-engine]{{cursor:{_CURSORS[shape]}!important}}</style>"
+        )
 
-            def select(event: Any) -> None:
-                """Call `do` with the corners of a rectangle."""
-                low, high = np.array(event.screen_min), np.array(event.screen_max)
-                self._submit(partial(do, read_view(event.client), low, high))
+        def handle(event: Any) -> None:
+            """Call `do` with the shape."""
+            path = np.array(event.screen_pos, float)
+            if len(path) == 2:  # viser's own rectangle, where our script did not take the drag
+                path = np.stack([path[[0, 1, 1, 0], 0], path[[0, 0, 1, 1], 1]], axis=1)
+            drag = Drag(read_view(event.client), path, event.modifier == "shift")
+            self._submit(partial(do, drag))
 
-            self._api.on_rect_select()(select)
+        listen_to_shapes(self._api, handle)
 
 
 def add_points(

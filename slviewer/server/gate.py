@@ -122,6 +122,8 @@ MESSAGES: dict[Role, frozenset[type]] = {
 }
 """The messages of viser that each role may send; all others, and those of later versions, are
 refused."""
+OUTLINE_LIMIT = 4096
+"""Places of a shape that is drawn into the 3D view: twice as many as our script sends."""
 TEXT_LIMIT = 20_000
 """Characters; no input of the wizard needs a tenth of it."""
 
@@ -191,7 +193,8 @@ class ViserGate:
             case messages.ScenePointerMessage():
                 _check(client.listens_to_pointer(message.event_type))
                 click = message.event_type == "click"
-                _check(len(message.screen_pos) == (1 if click else 2))
+                corners = len(message.screen_pos)
+                _check(corners == 1 if click else 2 <= corners <= OUTLINE_LIMIT)
                 _check(not click or None not in (message.ray_origin, message.ray_direction))
             case messages.LocalStorageGetItemResponseMessage():
                 _check(client.is_awaited(type(message)))

@@ -39,8 +39,11 @@ loader unpacks."""
 Message = _messages.Message
 
 CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
-PAGE_SCRIPT = resources.files("slviewer.server").joinpath("page_script.js").read_bytes()
-"""Our script, which runs in viser's page before its own."""
+PAGE_SCRIPT = b"\n".join(
+    resources.files("slviewer.server").joinpath(name).read_bytes()
+    for name in ("page_script.js", "pointer_script.js")
+)
+"""Our scripts, which run in viser's page before its own."""
 PAGE_STYLE = resources.files("slviewer.server").joinpath("page_style.css").read_bytes()
 """Our style of viser's page."""
 
@@ -320,6 +323,14 @@ def is_shown(handle: Any) -> bool:
                 return False
             box = box._parent
         handle = box
+
+
+def listen_to_shapes(scene: viser.SceneApi, callback: Callable[[Any], None]) -> None:
+    """Call back with each shape that is drawn into the scene by dragging, with Shift or without;
+    its `screen_pos` are all its places, of which viser's own event keeps two."""
+    for modifier in (None, "shift"):
+        kind: Any = _scene_handles.ScenePointerEvent
+        scene._register_scene_pointer_callback("rect-select", modifier, kind)(callback)  # type: ignore[arg-type]
 
 
 def listens_to_clicks(scene: Any, name: str) -> bool:

@@ -9,7 +9,7 @@ same frames.
 """
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -52,13 +52,6 @@ class ViewCamera:
         reach = np.tan(self.fov_rad / 2)
         return 0.5 + local[..., :2] / depth[..., None] / (2 * reach * np.array([self.aspect, 1.0]))
 
-    def is_near(self, other: "ViewCamera") -> bool:
-        """Whether another view shows a scene at the same place of the picture, to about a pixel."""
-        scale = max(float(np.linalg.norm(self.position)), 1.0)
-        moved = np.linalg.norm(self.position - other.position) / scale
-        turned = np.abs(self.R_scene_view - other.R_scene_view).max()
-        return bool(moved < 1e-3 and turned < 1e-3 and abs(self.aspect - other.aspect) < 1e-3)
-
 
 def select_in_outline(
     points: np.ndarray, view: ViewCamera, outline: Sequence[tuple[float, float]] | np.ndarray
@@ -71,14 +64,55 @@ def select_in_outline(
     corners = np.asarray(outline, np.float64)
     if corners.ndim != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise InputError(f"the outline has {len(corners)} corners: draw at least 3")
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    size = np.maximum(high - low, 1e-9)
+
+    def fill(raster: np.ndarray, path: np.ndarray, _: float) -> np.ndarray:
+        """Fill the outline."""
+        return np.asarray(cv2.fillPoly(raster, [path], 1))
+
+    return _select_drawn(points, view, corners, 0.0, fill)
+
+
+def select_along_path(
+    points: np.ndarray, view: ViewCamera, path: np.ndarray, radius: float
+) -> Mask:
+    """Mask (h, w) of the points (h, w, 3) mm that a view shows within ``radius``, a share of its
+    height, of a path (n, 2), in its 0 ... 1: what a round brush meets.
+
+    What is hidden behind other points is selected too. InputError for a path that is none.
+    """
+    path = np.asarray(path, np.float64)
+    if path.ndim != 2 or not len(path) or not np.isfinite(path).all():
+        raise InputError("the brush has no path: draw over the points")
+
+    def widen(raster: np.ndarray, path: np.ndarray, scale: float) -> np.ndarray:
+        """Mark what is within the radius of the path."""
+        cv2.polylines(raster, [path], False, 1)
+        raster[path[:, 1], path[:, 0]] = 1  # of a path of one point too
+        distance = cv2.distanceTransform(1 - raster, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return np.asarray(distance <= radius * scale)
+
+    return _select_drawn(points, view, path, radius, widen)
+
+
+def _select_drawn(
+    points: np.ndarray,
+    view: ViewCamera,
+    path: np.ndarray,
+    margin: float,
+    draw: Callable[[np.ndarray, np.ndarray, float], np.ndarray],
+) -> Mask:
+    """Mask (h, w) of the points (h, w, 3) mm that a view shows in what ``draw(raster, path (n, 2)
+    px, px a height of the view)`` marks, at most ``margin`` heights away from the path."""
+    stretch = np.array([view.aspect, 1.0])  # to heights of the view: circles are round
+    path = path * stretch
+    low = path.min(axis=0) - margin
+    scale = (_RASTER - 1) / max(float((path.max(axis=0) + margin - low).max()), 1e-9)
     raster = np.zeros((_RASTER, _RASTER), np.uint8)
-    cv2.fillPoly(raster, [np.rint((corners - low) / size * (_RASTER - 1)).astype(np.int32)], 1)
-    at = (view.project(points.astype(np.float64)) - low) / size
-    inside = ((at >= 0) & (at <= 1)).all(axis=-1)
-    pixel = np.rint(np.where(inside[..., None], at, 0) * (_RASTER - 1)).astype(int)
-    return inside & (raster[pixel[..., 1], pixel[..., 0]] == 1)
+    marked = draw(raster, np.rint((path - low) * scale).astype(np.int32), scale)
+    at = (view.project(points.astype(np.float64)) * stretch - low) * scale
+    inside = ((at >= 0) & (at <= _RASTER - 1)).all(axis=-1)
+    pixel = np.rint(np.where(inside[..., None], at, 0)).astype(int)
+    return inside & (marked[pixel[..., 1], pixel[..., 0]] != 0)
 
 
 def select_polygon(shape: tuple[int, ...], corners: np.ndarray) -> Mask:

@@ -200,17 +200,18 @@ def point_at(on: MeasuredSurface, place: Place) -> np.ndarray:
     return np.asarray(on.points[index], np.float64)
 
 
-def box_in_view(on: MeasuredSurface, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> Region:
+def box_in_view(on: MeasuredSurface, view: ViewCamera, corners: np.ndarray) -> Region:
     """Return the box, with sides along a view's, around what a rectangle shows of a surface: its
-    connected part in the middle. ``low``, ``high`` (2,): corners in the view, 0 ... 1. InputError
-    where it shows no measured point.
+    connected part in the middle. ``corners`` (4, 2): in the view, 0 ... 1. InputError where it
+    shows no measured point.
     """
-    corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     chosen = select_in_outline(on.points, view, corners) & on.measured
     if not chosen.any():
         raise InputError("the rectangle holds no measured point: drag it over the surface")
     if on.organised:
-        off = np.linalg.norm(view.project(on.points.astype(np.float64)) - (low + high) / 2, axis=-1)
+        off = np.linalg.norm(
+            view.project(on.points.astype(np.float64)) - corners.mean(axis=0), axis=-1
+        )
         v, u = np.unravel_index(int(np.argmin(np.where(chosen, off, np.inf))), chosen.shape)
         chosen = select_connected(on.points, (int(u), int(v)), chosen)
     return Region.around(on.points[chosen].astype(np.float64), view.R_scene_view.T)

@@ -42,8 +42,8 @@ from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
 
 pytestmark = [pytest.mark.computes, pytest.mark.slow]
 
-CORNERS = ((-30, -30), (30, -30), (30, 30), (-30, 30))
-"""Of an outline around a place on the page, px."""
+OUTLINE = 40 * np.array([(np.cos(t), np.sin(t)) for t in np.linspace(0, 2 * np.pi, 16)])
+"""Places (n, 2) of a lasso around a place on the page, px."""
 
 
 def capture_scans(
@@ -142,14 +142,13 @@ def to_screen(app: App, page: Page, point: np.ndarray) -> tuple[float, float]:
     return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
 
-def draw_outline(page: Page, x: float, y: float) -> None:
-    """Click the corners of an outline around (x, y) px, each once the wizard has the one before,
-    and close it."""
-    for count, (dx, dy) in enumerate(CORNERS, 1):
-        page.mouse.click(x + dx, y + dy)
-        expect(page.get_by_text(re.compile(f"{count} corners? set"))).to_be_visible()
-    click(page, "Close outline")
-    wait_until(page, lambda: count_selected(page) > 0)
+def drag(page: Page, places: np.ndarray) -> None:
+    """Press the mouse, move it over places (n, 2) px, and release it."""
+    page.mouse.move(*places[0])
+    page.mouse.down()
+    for place in places[1:]:
+        page.mouse.move(*place)
+    page.mouse.up()
 
 
 def wait_for_frames(page: Page, count: int = 3) -> None:
@@ -161,11 +160,7 @@ def wait_for_frames(page: Page, count: int = 3) -> None:
 
 def drag_rectangle(page: Page, x: float, y: float, size: float) -> None:
     """Drag a rectangle around (x, y) px."""
-    page.mouse.move(x - size, y - size)
-    page.mouse.down()
-    page.mouse.move(x, y, steps=4)
-    page.mouse.move(x + size, y + size, steps=4)
-    page.mouse.up()
+    drag(page, np.array([(x - size, y - size), (x, y), (x + size, y + size)]))
 
 
 def count_selected(page: Page) -> int:
@@ -184,12 +179,37 @@ def test_points_are_selected_deleted_and_restored(
     v, u = valid[np.argmin(np.abs(valid - np.median(valid, axis=0)).sum(axis=1))]
     unfold(page, "Edit points")
     choose(page, "Select by", "lasso")
-    expect(page.get_by_text("Click around the points")).to_be_visible()
+    expect(page.get_by_text("Drag a line around")).to_be_visible()
     views.wait_for(page, cloud.points)
     x, y = to_screen(app, page, cloud.points[v, u])
-    draw_outline(page, x, y)
+    drag(page, np.array([x, y]) + OUTLINE)
+    wait_until(page, lambda: count_selected(page) > 0)
     selected = count_selected(page)
+    (client,) = app.server.viser.get_clients().values()
+    box = page.locator("canvas").first.bounding_box()
+    assert box is not None
+    size = np.array([box["width"], box["height"]])
+    away = read_view(client).project(cloud.points) * size + [box["x"], box["y"]] - [x, y]
+    inside = np.linalg.norm(away, axis=-1) < 40.0
     assert 20 < selected < 0.5 * len(valid)
+    # the lasso has 15 sides, the mouse whole pixels
+    assert 0.93 * inside.sum() < selected <= inside.sum() + 10
+
+    choose(page, "Select by", "brush")
+    expect(page.get_by_text("Drag over the points")).to_be_visible()
+    wait_until_still(page)
+    drag(page, np.array([(x - 120.0, y), (x - 60, y), (x, y)]))
+    wait_until(page, lambda: count_selected(page) > selected)
+    page.keyboard.down("Shift")
+    drag(page, np.array([(x - 120.0, y), (x - 60, y), (x, y)]))
+    page.keyboard.up("Shift")
+    wait_until(page, lambda: 0 < count_selected(page) < selected)
+    click(page, "Select nothing")
+    choose(page, "Select by", "lasso")
+    expect(page.get_by_text("Drag a line around")).to_be_visible()
+    wait_until_still(page)
+    drag(page, np.array([x, y]) + OUTLINE)
+    wait_until(page, lambda: count_selected(page) == selected)
     click(page, "Delete selected")
     wait_until(page, lambda: len(operator.snapshot().scan("one").edits) == 1)  # type: ignore[union-attr]
     (edit,) = load_edits(operator.session, "one").active
@@ -232,12 +252,13 @@ def test_points_of_two_scans_are_deleted_and_restored_in_step_merge(
     expect(button(page, "Merge 2 scans")).to_be_visible()
     unfold(page, "Edit points")
     choose(page, "Select by", "lasso")
-    expect(page.get_by_text("Click around the points")).to_be_visible()
+    expect(page.get_by_text("Drag a line around")).to_be_visible()
     views.wait_for(page, points)
     valid = np.argwhere(np.isfinite(points[..., 2]))
     v, u = valid[np.argmin(np.abs(valid - np.median(valid, axis=0)).sum(axis=1))]
     x, y = to_screen(app, page, points[v, u])
-    draw_outline(page, x, y)
+    drag(page, np.array([x, y]) + OUTLINE)
+    wait_until(page, lambda: count_selected(page) > 0)
     selected = count_selected(page)
 
     def edits() -> list[int]:

@@ -13,7 +13,7 @@ from server_client import CAMERA, announced, settle
 from slviewer.errors import SlviewerError
 from slviewer.server import viser_internals
 from slviewer.server.access import ROLES, MessageRefused
-from slviewer.server.gate import MESSAGES, UploadBudget, ViserGate
+from slviewer.server.gate import MESSAGES, OUTLINE_LIMIT, UploadBudget, ViserGate
 
 
 def test_the_operator_works(operator, gui):
@@ -277,6 +277,17 @@ def test_the_scene_answers_only_where_someone_listens(server, operator):
     assert until(lambda: "scene" in calls)
     settle(client)
     assert calls.count("scene") == 1
+
+    shapes: list = []
+    viser_internals.listen_to_shapes(scene, shapes.append)
+    drawn = {**POINTER, "event_type": "rect-select", "ray_origin": None, "ray_direction": None}
+    for count in (1, OUTLINE_LIMIT + 1, OUTLINE_LIMIT):
+        places = [[count / 1e4, i / 1e4] for i in range(count)]
+        client.send("ScenePointerMessage", **{**drawn, "screen_pos": places, "modifier": "shift"})
+    assert until(lambda: shapes)
+    settle(client)
+    (shape,) = shapes
+    assert len(shape.screen_pos) == OUTLINE_LIMIT and shape.modifier == "shift"
 
 
 def test_a_drag_of_a_removed_gizmo_still_ends(server, operator):

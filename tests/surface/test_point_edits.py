@@ -14,6 +14,7 @@ from slviewer.surface.selection import (
     detect_support,
     make_edit,
     pack_mask,
+    select_along_path,
     select_connected,
     select_in_outline,
     select_polygon,
@@ -105,11 +106,22 @@ def test_an_outline_selects_what_any_view_shows_inside() -> None:
         select_in_outline(points, CAMERA, outline[:2])
 
 
-def test_views_that_moved_are_told_apart() -> None:
-    assert CAMERA.is_near(ViewCamera(np.full(3, 1e-4), np.eye(3), CAMERA.fov_rad, CAMERA.aspect))
-    assert not CAMERA.is_near(
-        ViewCamera(np.array([1.0, 0, 0]), np.eye(3), CAMERA.fov_rad, CAMERA.aspect)
-    )
+def test_a_brush_selects_what_lies_within_its_radius() -> None:
+    points, _ = on_table()
+    view = ViewCamera(CAMERA.position, CAMERA.R_scene_view, CAMERA.fov_rad, 1.6)
+    at = view.project(points.astype(float)) * [1.6, 1.0]
+    path = np.array([[0.4, 0.3], [0.6, 0.7]])
+    chosen = select_along_path(points, view, path, 0.1)
+    start, end = path * [1.6, 1.0]
+    share = np.clip((at - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+    truth = np.linalg.norm(at - start - share[..., None] * (end - start), axis=-1) < 0.1
+    assert truth.sum() > 500
+    assert (chosen != truth).sum() < 0.01 * truth.sum()
+    dot = select_along_path(points, view, path[:1], 0.1)
+    near = np.linalg.norm(at - start, axis=-1) < 0.1
+    assert near.sum() > 100 and (dot != near).sum() < 0.02 * near.sum()
+    with pytest.raises(InputError):
+        select_along_path(points, view, path[:0], 0.1)
 
 
 def test_the_connected_part_ends_at_jumps() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.gui.measure_list import InspectionInputs, MeasurementList
 from slviewer.gui.panel import NO_SESSION, PanelPart, StepPanel, scan_options
-from slviewer.gui.scene import Click
+from slviewer.gui.scene import Click, Drag
 from slviewer.gui.steps.scan import sort_scans
 from slviewer.gui.widgets import Html, Text, colour_bar, note, paint, to_html
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
@@ -21,7 +21,6 @@ from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.measurement import Measurement
 from slviewer.report.canvas import round_up
 from slviewer.session.nominal import MM, Units
-from slviewer.surface.selection import ViewCamera
 from slviewer.wizard.result_views import box_in_view, place_at, point_at
 from slviewer.wizard.snapshot import SessionView
 
@@ -338,7 +337,7 @@ class MeasurePanel(StepPanel):
         if self._visible:  # before the instruction appears, so that no click is lost
             self._escape.disabled = not name
             rectangle = self._tool.fits and self._tool.by_rectangle
-            self._scene.on_rectangle(self._handle_rectangle if rectangle else None)
+            self._scene.on_drag("rectangle", self._handle_rectangle if rectangle else None)
             clicks = self._tool.clicks and not rectangle
             self._scene.on_click(self._handle_click if clicks else None)
 
@@ -347,10 +346,10 @@ class MeasurePanel(StepPanel):
         self._tool.by_rectangle = self._by.value == RECTANGLE
         self._select_tool(self._tool.name)
 
-    def _handle_rectangle(self, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> None:
+    def _handle_rectangle(self, drag: Drag) -> None:
         """Take the box around what a dragged rectangle shows."""
         if self._on is not None and self._tool.fits:
-            self._tool.box = box_in_view(self._on, view, low, high)
+            self._tool.box = box_in_view(self._on, drag.view, drag.path)
             self.redraw()
 
     def _handle_click(self, click: Click) -> None:
