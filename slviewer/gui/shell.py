@@ -9,6 +9,7 @@ import html
 import importlib
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import cv2
@@ -16,7 +17,7 @@ import numpy as np
 import viser
 
 from slviewer.calibration.next_pose import nominal_lens
-from slviewer.evaluation.render import format_count
+from slviewer.evaluation.render import format_counts
 from slviewer.gui.panel import NO_SESSION, ButtonColour, ControlGroup, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.widgets import (
@@ -79,7 +80,8 @@ class Shell(ControlGroup):
         self._drawn_devices: tuple[CalibrationView | None, tuple[int, int] | None] = (None, None)
         self._panels: dict[str, StepPanel] = {}
         self._shown_key = self._autopilot_key = self._following_key = ""
-        self.current = next((s.key for s in steps if s.state != "done"), steps[0].key)
+        self._folder: Path | None = None
+        self.current = find_first_step(steps)
         """The step that is shown, or will be with the next drawing."""
         self._gui.set_panel_label("slviewer")
         self._build_left(steps)
@@ -155,6 +157,10 @@ class Shell(ControlGroup):
 
     def update(self, snapshot: Snapshot) -> None:
         """Update the page from a snapshot."""
+        if snapshot.session and snapshot.session.folder != self._folder:
+            self._folder = snapshot.session.folder
+            if snapshot.step(self.current).state == "blocked":  # in another session
+                self.go(find_first_step(snapshot.steps))
         self._follow_autopilot(snapshot)
         key = self.current
         if key != self._shown_key:
@@ -253,12 +259,9 @@ class Shell(ControlGroup):
             about = alert("No session is open: enter a folder.", "warning")
             self._counts.set(note("No session is open.", "warning"))
         else:
-            counts = (
-                format_count(len(session.poses), "pose"),
-                format_count(len(session.scans), "scan"),
-            )
+            kinds = ["pose"] * len(session.poses) + [scan.purpose for scan in session.scans]
             name = f'<b style="overflow-wrap:anywhere">{to_html(session.folder.name)}</b>'
-            lines = [name, ", ".join(counts)]
+            lines = [name, format_counts(kinds)]
             self._counts.set(paragraph(Html("<br>".join(lines))))
             folder = f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}'
             lines.insert(1, f"{folder}</span>")
@@ -312,6 +315,11 @@ class Shell(ControlGroup):
             self._operator.cancel()
         else:
             self._operator.start_autopilot(Autopilot(self._operator, pause_s=0.5))
+
+
+def find_first_step(steps: Sequence[StepView]) -> str:
+    """Return the key of the first step that is not done, else of the first one."""
+    return next((step.key for step in steps if step.state != "done"), steps[0].key)
 
 
 def autopilot_step(snapshot: Snapshot) -> str:

@@ -443,11 +443,18 @@ class LiveImage(Picture):
         self.set(draw_preview(preview), legend(preview, exposure_html(preview)))
 
     def draw_board(
-        self, preview: PreviewView, board: Board | None, ghost_px: np.ndarray | None = None
+        self,
+        preview: PreviewView,
+        board: Board | None,
+        ghost_px: np.ndarray | None = None,
+        *,
+        is_wanted: bool = True,
     ) -> None:
-        """Show a frame with the detected board, and where to hold it next."""
+        """Show a frame with the detected board, and where to hold it next; a board that is not
+        `is_wanted` is not missed."""
         hint = "" if ghost_px is None else "Dashed blue: hold the board here"
-        lines = board_html(preview, board), exposure_html(preview), coloured(hint, "info")
+        found = board_html(preview, board, is_wanted)
+        lines = found, exposure_html(preview), coloured(hint, "info")
         self.set(draw_preview(preview, board, ghost_px), legend(preview, *lines))
 
 
@@ -489,10 +496,12 @@ def exposure_html(preview: PreviewView) -> Html:
     return coloured(f"Well exposed, peak at {100 * preview.brightest:.0f} %", "good")
 
 
-def board_html(preview: PreviewView, board: Board | None) -> Html:
-    """Describe whether the board is detected, or why not."""
+def board_html(preview: PreviewView, board: Board | None, is_wanted: bool = True) -> Html:
+    """Describe whether the board is detected, or why not, as a fault while it `is_wanted`."""
     if board is None:
         return coloured("No board is chosen", "dim")
+    if preview.board is None and not is_wanted:
+        return coloured("No board in view", "dim")
     if preview.board is None:
         missing = preview.missing or "searching for the board …"
         return coloured(f"{missing[:1].upper()}{missing[1:]}", "warning")

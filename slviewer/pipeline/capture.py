@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -38,7 +37,7 @@ from slviewer.pipeline.suggest_exposure import (
 )
 from slviewer.records.plain import to_plain
 from slviewer.session.atomic import format_bytes
-from slviewer.session.capture import Capture, Role, TurnStep
+from slviewer.session.capture import Capture, Purpose, Role, TurnStep
 from slviewer.session.names import new_name
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -46,9 +45,6 @@ from slviewer.target.board import Board
 DEFAULT_PATTERNS = "complementary"
 """The sequence used by default: its codes forgive blurred edges, and it is shorter than the
 Letter's."""
-
-Purpose = Literal["pose", "scan", "plane", "sphere"]
-"""What a capture is made for: all but target poses are scans."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -546,7 +546,7 @@ def list_placements(store: Session) -> dict[str, Placement | None]:
             f"{PLACEMENTS}/{each.name}", lambda meta, _: read_record(Placement, meta), only=()
         )
         for each in captures
-        if each.meta.get("settings", {}).get("purpose", "scan") == "scan"
+        if each.purpose == "scan"
     }
 
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
-from slviewer.evaluation.render import format_count
+from slviewer.evaluation.render import format_count, format_counts
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
 from slviewer.records.acceptance import MARKS, Decision
@@ -96,13 +96,8 @@ class SessionData:
 
 def session_title(data: SessionData) -> tuple[str, str]:
     """The page's title and the sentence below it."""
-    roles = [each.capture.role for each in data.captures]
-    counts = [
-        format_count(len(roles), "capture"),
-        format_count(_count_used(data), "target pose"),
-        format_count(roles.count("scan"), "scan"),
-    ]
-    return data.name, "{}: {} used to calibrate, {}.".format(*counts)
+    counts = format_counts(each.capture.purpose for each in data.captures)
+    return data.name, f"{counts}; {format_count(_count_used(data), 'pose')} used to calibrate."
 
 
 def _count_used(data: SessionData) -> int:

@@ -28,6 +28,8 @@ from slviewer.session.stack import (
 )
 
 Role = Literal["calibration", "scan"]
+Purpose = Literal["pose", "scan", "plane", "sphere"]
+"""What a capture is made for: all but target poses are scans."""
 Comparison = Literal["absent", "same", "damaged", "different"]
 """Of a stored capture with a new one: "damaged" was the same when it was saved."""
 
@@ -71,6 +73,12 @@ class Capture:
     folder: Path
     # content of capture.json: source, settings, board, ...
     meta: dict[str, Any] = field(repr=False, compare=False)
+
+    @property
+    def purpose(self) -> Purpose:
+        """What was captured: a pose of the target, an object, or a shape to verify with."""
+        own: Purpose = "pose" if self.role == "calibration" else "scan"
+        return self.meta.get("settings", {}).get("purpose", own)
 
     @property
     def is_imported_cloud(self) -> bool:

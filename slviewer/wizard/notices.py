@@ -38,6 +38,12 @@ class Notices:
         ("Calibrating")."""
         self.add("error", describe_failure(action, error))
 
+    def clear(self) -> None:
+        """Forget the notices: those of another session."""
+        with self._lock:
+            self._latest.clear()
+        self._changed()
+
     def all(self) -> tuple[Notice, ...]:
         """Return the latest notices, oldest first."""
         with self._lock:

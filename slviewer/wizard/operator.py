@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture
 from slviewer.devices.protocols import Rig
@@ -36,7 +36,7 @@ from slviewer.pipeline.turn import (
     require_turntable,
 )
 from slviewer.session import atomic
-from slviewer.session.capture import TurnStep
+from slviewer.session.capture import Purpose, TurnStep
 from slviewer.session.importers.archive import unpack, unpacked_size
 from slviewer.session.names import new_name, plain_name
 from slviewer.session.reading import expand_user
@@ -47,8 +47,10 @@ from slviewer.wizard.rig_requests import RigRequests
 from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import PreviewView, Snapshot
 
-Purpose = Literal["scan", "plane", "sphere"]
 IMPORTING = "Importing"
+BOARD_S = 10.0
+"""Age of a detection up to which the board is taken to be in view still: no image is searched while
+something is captured."""
 UNPACKED = "import"
 """Name in the session's folder beside which an upload is unpacked: the session clears what a crash
 leaves of it."""
@@ -175,13 +177,17 @@ class Operator(RigRequests, ResultRequests):
         self._capture_scan("scan", label)
 
     @request("Capturing the plane")
-    def capture_plane(self, label: str = "") -> None:
-        """Capture a flat plate and compare the models on it."""
+    def capture_plane(self, label: str = "", *, anyway: bool = False) -> None:
+        """Capture a flat plate and compare the models on it; `anyway`: also while the board is in
+        view."""
+        self._require_no_board(anyway)
         self._capture_scan("plane", label)
 
     @request("Capturing the sphere")
-    def capture_sphere(self, label: str = "") -> None:
-        """Capture a sphere and compare the models on it."""
+    def capture_sphere(self, label: str = "", *, anyway: bool = False) -> None:
+        """Capture a sphere and compare the models on it; `anyway`: also while the board is in
+        view."""
+        self._require_no_board(anyway)
         self._capture_scan("sphere", label)
 
     @request("Switching hands-free capture")
@@ -207,6 +213,18 @@ class Operator(RigRequests, ResultRequests):
 
         self._queue_capture(name, self._pose_sequence(), save)
 
+    def _require_no_board(self, anyway: bool) -> None:
+        """Raise InputError while the live image shows the board, unless it is wanted there."""
+        view, world = self._preview, self._scene
+        board = view.board if view else None
+        # what stands before the simulated rig may have been exchanged since the latest image
+        is_there = board is not None and (world is None or world.standing == "board")
+        if board and is_there and time.monotonic() - board.time_s < BOARD_S and not anyway:
+            raise InputError(
+                "the board is in view, and would be measured: take it away, or choose to capture"
+                " with the board in view"
+            )
+
     def _capture_scan(self, purpose: Purpose, label: str) -> None:
         """Queue the capture of a scan, plane or sphere."""
         name = self._next_name(purpose)
@@ -230,7 +248,7 @@ class Operator(RigRequests, ResultRequests):
         if label.strip():
             self._set_label(name, label)
         self._queue_processing()
-        if purpose != "scan":
+        if purpose in ("plane", "sphere"):
             self.verify([name], purpose)
             return
         self.reconstruct(name)

@@ -50,6 +50,8 @@ class RigRequests(Engine):
         Jobs of the previous session are cancelled. If the remembered rig is not connected, the
         session opens without. Where the session is open already, only the rig changes.
         """
+        if not str(path).strip():
+            raise InputError("no folder is named: enter the folder of a session, or of a new one")
         with self._lock:
             if not self._acquisition.idle:
                 raise InputError(
@@ -68,6 +70,7 @@ class RigRequests(Engine):
             self.show(merge_failure="")
             if before:
                 before.close()
+                self._notices.clear()
             for name in store.recovered:
                 self._notices.add(
                     "info",

@@ -362,7 +362,7 @@ class SessionReader:
         return ScanView(
             name=capture.name,
             label=str(labels.get(capture.name, capture.name)),
-            purpose=capture.meta.get("settings", {}).get("purpose", "scan"),
+            purpose=capture.purpose,
             created=str(capture.meta.get("created", "")),
             cloud="absent" if found is None else "stale" if found.stale else "fresh",
             figures=Reconstruction() if found is None else found.record,

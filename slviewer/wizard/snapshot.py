@@ -23,7 +23,7 @@ from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict
 from slviewer.registration.refusal import Reason
-from slviewer.session.capture import TurnStep
+from slviewer.session.capture import Purpose, TurnStep
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 
@@ -182,7 +182,7 @@ class ScanView:
 
     name: str
     label: str
-    purpose: Literal["scan", "plane", "sphere"]
+    purpose: Purpose
     created: str
     cloud: Literal["absent", "fresh", "stale"]
     figures: Reconstruction  # of the cloud

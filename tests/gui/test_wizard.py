@@ -242,7 +242,7 @@ def scan(page: Page, operator: Operator) -> None:
             lambda s, n=name: (v := s.scan(n)) is not None and v.cloud == "fresh", PATIENCE_S
         )  # type: ignore[misc]
         expect(page.get_by_text(name).first).to_be_visible()
-    expect(page.get_by_text("6 poses, 5 scans")).to_be_visible()
+    expect(page.get_by_text("6 poses, 3 scans, 1 plane, 1 sphere")).to_be_visible()
     click_cloud_until(page, page.get_by_text("Clicked point").is_visible)
 
     click(page, "4. Calibrate")  # its curves, at a pixel of this cloud

@@ -221,7 +221,9 @@ def test_a_sessions_report(tmp_path: Path) -> None:
     )
     assert missing_facts(words, *facts) == []
     path = tmp_path / "report.html"
-    write_page(path, *session_title(data), session_headlines(data), sections)
+    title, counts = session_title(data)
+    assert missing_facts(counts, f"{len(data.captures) - 1} poses", "1 scan") == []
+    write_page(path, title, counts, session_headlines(data), sections)
     page = path.read_text(encoding="utf-8")
     assert "&lt;script&gt;" in page and "<script" not in page and "<b>" not in page
     assert set(re.findall(r'src="([^:"]*):', page)) == {"data"}

@@ -49,6 +49,7 @@ def test_requests_that_cannot_be_granted_become_notices() -> None:
             (operator.capture_pose, ["session"]),
             (operator.calibrate, ["session"]),
             (lambda: operator.open_session("/proc/nowhere/session"), ["/proc/nowhere/session"]),
+            (lambda: operator.open_session(" "), ["folder", "enter"]),
             (
                 lambda: operator.choose_rig({"driver": "no such"}),
                 ["driver", "no such", "simulated"],
@@ -219,6 +220,19 @@ def test_hands_free_captures_a_board_that_is_held_still_once(tmp_path: Path) -> 
         assert list(states(operator.wait_until_idle())) == ["pose_01"]
 
 
+def test_a_plane_is_not_captured_while_the_board_is_surely_in_view(operator: Operator) -> None:
+    def refusal(**options: bool) -> str:
+        """What a capture of a plane lacks; there is no calibration yet."""
+        assert not operator.capture_plane(**options)
+        return last_notice(operator.wait_until_idle())
+
+    assert operator.place_at_suggestion()
+    until(lambda: missing_facts(refusal(), "board", "in view") == [])  # once it is detected
+    assert missing_facts(refusal(anyway=True), "calibrate") == []
+    operator.place("plane")  # the latest image still shows the board
+    assert missing_facts(refusal(), "calibrate") == []
+
+
 def test_a_session_is_opened_for_one_operator_and_changed_for_another(
     operator: Operator, tmp_path: Path
 ) -> None:
@@ -228,7 +242,9 @@ def test_a_session_is_opened_for_one_operator_and_changed_for_another(
             missing_facts(last_notice(other.wait_until_idle()), tmp_path / "session", os.getpid())
             == []
         )
+    assert not operator.capture_scan() and operator.notices()
     assert operator.open_session(tmp_path / "second") and operator.session is not None
+    assert operator.notices() == ()  # those of the first session
     assert operator.session.folder == tmp_path / "second"
     Session.open(tmp_path / "session", write=True).close()
     view = operator.wait_until_idle()

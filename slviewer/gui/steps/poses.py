@@ -204,7 +204,8 @@ class PosesPanel(StepPanel):
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image with the detected board, and the countdown of a hands-free
         capture."""
-        self._picture.draw_board(preview, self._board, self._ghost_px)
+        is_wanted = self.snapshot.step(self.key).state != "done"
+        self._picture.draw_board(preview, self._board, self._ghost_px, is_wanted=is_wanted)
         count = preview.countdown_s
         if count is not None and not self._is_counting:
             self._sound.play("tick")
@@ -306,7 +307,8 @@ class PosesPanel(StepPanel):
             if self._drawn_poses.get(name) != key:
                 self._drawn_poses[name] = key
                 colour, width = _STATES[pose.state][1], 4.0 if is_chosen else 2.0
-                image, label = rectified(pose, board, camera), name.removeprefix("pose_")
+                # boards lie close together: the names of all of them would lie on each other
+                image, label = rectified(pose, board, camera), name if is_chosen else ""
                 picture = self.layer.board(
                     name, T, board.outline(), colour, width, picture=image, label=label
                 )

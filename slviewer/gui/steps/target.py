@@ -91,7 +91,7 @@ class TargetPanel(StepPanel):
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image with the detected board."""
-        self._picture.draw_board(preview, self._board)
+        self._picture.draw_board(preview, self._board, is_wanted=not self.session.good_poses)
 
     def _parse_entered(self) -> Board:
         """Return the board that the fields describe. Raises InputError for an invalid one."""

@@ -34,12 +34,22 @@ class VerifyPanel(StepPanel):
             self._picture = LiveImage(gui, "Live image", width_px=SMALL_PX)
             self._captures = [
                 self.button(
-                    "Capture plane", lambda: operator.capture_plane(label.value), "square", None
+                    "Capture plane",
+                    lambda: operator.capture_plane(label.value, anyway=self._anyway.value),
+                    "square",
+                    None,
                 ),
                 self.button(
-                    "Capture sphere", lambda: operator.capture_sphere(label.value), "sphere", None
+                    "Capture sphere",
+                    lambda: operator.capture_sphere(label.value, anyway=self._anyway.value),
+                    "sphere",
+                    None,
                 ),
             ]
+            self._anyway = self.checkbox(
+                "Capture with board in view", "For a plate or sphere that stands before the board"
+            )
+            self._anyway.visible = False
             label = gui.add_text("Name", "", hint="Optional; numbered by default")
             SimulatedObject(self, *_ICONS)
         with gui.add_folder("Result") as self._result_folder:
@@ -106,8 +116,11 @@ class VerifyPanel(StepPanel):
             self._draw_result(results[self._result.value])
 
     def draw_preview(self, preview: PreviewView) -> None:
-        """Show the live image."""
+        """Show the live image, and offer to capture with the board in view."""
         self._picture.draw(preview)
+        self._anyway.visible = preview.board is not None
+        if self._anyway.value and not self._anyway.visible:
+            self._anyway.value = False
 
     # drawing
 
