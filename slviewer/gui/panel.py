@@ -17,7 +17,7 @@ import viser
 from slviewer.devices.browser import PageChannels, PageRole
 from slviewer.devices.page_channel import PageState
 from slviewer.errors import InputError, hide_passwords
-from slviewer.gui.scene import Colour, ViewerScene, Viewpoints, look_at_points
+from slviewer.gui.scene import Colour, ViewerScene, Viewpoints
 from slviewer.gui.widgets import NOTICES, link, paragraph
 from slviewer.server.secure import SafeServer
 from slviewer.session.store import Session
@@ -464,17 +464,6 @@ class StepPanel(ControlGroup):
         if self._visible and self._shown:
             name, points = self._shown
             self.context.viewpoints.show(f"{self.key} {name}", points)
-
-    def view_button(self) -> None:
-        """Add a button that moves the clicking browser's view to what is shown, if anything is."""
-
-        def look(event: Any) -> None:
-            """Move the view of the browser that clicked to the points."""
-            if self._shown and self._shown[1] is not None:
-                look_at_points(event.client, self._shown[1])
-
-        button = self._gui.add_button("Zoom to fit", icon=viser.Icon.FOCUS_2, color="gray")
-        button.on_click(lambda event: self.context.submit(partial(look, event)))
 
     def update(self, snapshot: Snapshot) -> None:
         """Show a snapshot; called after each change while the panel is shown, and right after

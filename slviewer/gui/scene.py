@@ -319,10 +319,15 @@ class ViewerScene:
 
             def handle(event: Any) -> None:
                 """Call `do` with the place and ray of a click."""
-                place, origin, direction = map(
-                    np.array, (event.screen_pos, event.ray_origin, event.ray_direction)
+                camera = event.client.camera
+                origin, direction = map(np.array, (event.ray_origin, event.ray_direction))
+                # where the ray of a wide view would begin: at a point near a ray, as a share of its
+                # depth, as many pixels then lie between in a narrow view, from far away
+                away = float(np.linalg.norm(np.subtract(camera.look_at, camera.position)))
+                origin = origin + (1 - _relative_size(camera)) * away * direction
+                click = Click(
+                    read_view(event.client), np.array(event.screen_pos), origin, direction
                 )
-                click = Click(read_view(event.client), place, origin, direction)
                 self._submit(partial(do, click))
 
             self._api.on_click()(handle)
@@ -434,10 +439,10 @@ class Viewpoints:
             return
         self._shown = name
         for client in self._server.get_clients().values():
-            look_at_points(client, points)
+            _look_at_points(client, points)
 
 
-def look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
+def _look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
     """Move one browser's view to the points (..., 3) mm; nothing happens where none is valid."""
     flat = points.reshape(-1, 3)
     flat = flat[np.isfinite(flat[:, 2])][:: max(1, len(flat) // 20_000)]
@@ -447,7 +452,13 @@ def look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     # the field of view is that of the height
     away = max(1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0)
-    _set_view(client, middle + _FROM * away, middle)
+    _set_view(client, middle + _FROM * away / _relative_size(client.camera), middle)
+
+
+def _relative_size(camera: viser.CameraHandle) -> float:
+    """Return how large a browser's field of view is relative to that of the perspective view; an
+    orthographic view has a small one, from far away."""
+    return float(np.tan(camera.fov / 2) / np.tan(FIELD_OF_VIEW / 2))
 
 
 def _set_view(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:

@@ -195,7 +195,6 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
         click(page, "Reconstruct")
         assert operator.wait_for(lambda s, name=name: s.scan(name).cloud == "fresh", PATIENCE_S)  # type: ignore[misc]
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
-    click(page, "Zoom to fit")
     choose(page, "Colour", "depth")
     expect(page.get_by_text(re.compile(r"^\d+\.\d\smm$")).first).to_be_visible()
     click_until(page, (590, 420), "Phase, axis x")  # right of where notifications stand

@@ -105,7 +105,6 @@ class CalibratePanel(StepPanel):
             self._column = self.number("Pixel u", 0, 0, step=1, hint="Column")
             self._row = self.number("Pixel v", 0, 0, step=1, hint="Row")
             self._over = self.choice("Cloud", "Click a point of it to choose its pixel")
-            self.view_button()
             self._curve_note = Text(gui)
             self._curves = Plot(gui)
 

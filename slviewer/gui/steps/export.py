@@ -119,7 +119,6 @@ class ExportPanel(StepPanel):
             )
             self._shape_note = Text(gui)
             self._write = self.button("Write file", self._request_shape, "file-export", None)
-            self.view_button()
         with gui.add_folder("Calibration and poses"):
             self._numbers = numbers = self.choice("Content")
             self._number_format = self.choice("Format")

@@ -40,7 +40,6 @@ class SurfaceView(PanelPart):
         self._choice = self.choice("Surface")
         self._colour = self.dropdown("Colour", COLOURS)
         self._legend = Text(self._gui)
-        self.panel.view_button()
 
     @property
     def name(self) -> str:

@@ -76,7 +76,6 @@ class MergePanel(StepPanel):
         self._undo = self.button("Undo merge", operator.undo_merge, "arrow-back-up", "orange")
         self._view = self.choice("3D view")
         self._legend = Text(gui)
-        self.view_button()
         self._editing = PointEditing(self, self._redraw)
 
     def draw(self) -> None:

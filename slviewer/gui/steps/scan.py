@@ -118,7 +118,6 @@ class ScanPanel(StepPanel):
             self._view = self.choice("3D view")
             self._colour = self.dropdown("Colour", COLOURS)
             self._legend = Text(gui)
-            self.view_button()
             self._point = Text(gui)
             self._region = RegionInputs(self)
             self._editing = PointEditing(self, self._redraw, self._show_point)

@@ -58,7 +58,6 @@ class VerifyPanel(StepPanel):
             self._maps = Plot(gui)
             self._model = self.choice("3D colours", "The model whose errors colour the cloud")
             self._legend = Text(gui)
-            self.view_button()
         with gui.add_folder("All results") as self._table_folder:
             self._table = Text(gui)
             self.button("Write CSV", lambda: operator.export("table"), "table-export")
