@@ -69,6 +69,7 @@ class CameraCalibration:
         total = len(self.picture_rms_px) + len(self.excluded)
         return "\n".join(
             [
+                self.verdict.text(),
                 f"pictures: {len(self.picture_rms_px)} of {total} used, {width}x{height} px",
                 *(f"  excluded: {name}: {why}" for name, why in self.excluded.items()),
                 f"camera: reprojection RMS {self.rms_px:.3f} px",
@@ -78,7 +79,6 @@ class CameraCalibration:
                     f" {K[1, 2]:.1f} px"
                 ),
                 "  distortion k1 k2 p1 p2 k3: " + ", ".join(f"{d:.5f}" for d in D),
-                self.verdict.text(),
             ]
         )
 

@@ -2,14 +2,14 @@
 devices, imports, the calibration with what may follow it, and the wizard."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from slviewer import terminal
 from slviewer.commands.command import (
@@ -32,6 +32,7 @@ from slviewer.errors import DeviceError, InputError, UsageError
 if TYPE_CHECKING:
     from slviewer.devices.browser import PageChannels, PageRole
     from slviewer.pipeline.rig_choice import SetUp
+    from slviewer.records.calibration import ModelCalibration
     from slviewer.server.secure import Serving
 
 PAGE_PATIENCE_S = 600.0
@@ -180,16 +181,18 @@ class CalibrateOptions:
             or in a folder in its place; the session stays as it is.
         out: With --camera-only: write the lens to this .yml, .xml or .json, for --camera and for
             OpenCV.
+        verbose: Print the figures of each model too.
     """
 
     validate: bool = False
     camera_only: bool = False
     out: Path | None = None
+    verbose: Annotated[bool, arg(aliases=["-v"])] = False
 
 
 def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
-    """Calibrate the rig, or the camera alone with --camera-only; compare the models with
-    --validate."""
+    """Calibrate the rig, or the camera alone with --camera-only, and print the verdict first;
+    compare the models with --validate."""
     options, json_file = take_options(arguments, CalibrateOptions), arguments.pop("json")
     if options.camera_only:
         if arguments["camera"] is not None:
@@ -210,7 +213,10 @@ def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
     else:
         result = call(calibrate, **arguments)
     data = result.to_json()
-    terminal.print_result(result.text())
+    if not options.camera_only:
+        terminal.print_result(_summarise_calibration(result))
+    if options.camera_only or options.verbose:
+        terminal.print_result(result.text())
     if options.camera_only and options.out is not None:
         terminal.print_result(
             f"written to {options.out}; next: slviewer calibrate SESSION --target"
@@ -227,6 +233,16 @@ def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
 
         terminal.print_result(describe_default_model(arguments["session"]))
     write_json(json_file, data)
+
+
+def _summarise_calibration(found: Mapping[str, "ModelCalibration"]) -> str:
+    """Return the verdict, a line for each model, and the excluded poses with their reasons."""
+    stereo = found["stereo"]
+    lines = [] if stereo.verdict is None else [stereo.verdict.text()]
+    lines += [f"{name}: {each.fit.summary()}" for name, each in found.items() if each.fit]
+    excluded = getattr(stereo.fit, "excluded", {})
+    lines += [f"excluded: {name}: {why}" for name, why in excluded.items()]
+    return "\n".join([*lines, "figures of each model: -v"])
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,11 @@ from copies import copy_session
 from facts import missing_facts
 from small_fields import fit_few_cells
 
+from slviewer.commands.runs import CalibrateOptions, run_calibrate
 from slviewer.pipeline.models import load_stereo
+from slviewer.pipeline.operation import Findings
+from slviewer.records.calibration import ModelCalibration, StereoFit
+from slviewer.records.verdict import Finding, Verdict
 from slviewer.session.exporters import write_calibration
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
@@ -47,6 +51,25 @@ def test_calibrate_reports_what_its_contract_says(calibrated: dict) -> None:
     }
     assert models["splined"]["fit"]["noise_px"]["camera"] < 0.03
     assert len(fit["poses"]) == 8 and fit["excluded"] == {}
+
+
+def test_calibrate_prints_its_verdict_first_and_figures_on_request(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blurred = Finding("blur", "doubtful", "pose_03 is blurred", "focus, and capture it again")
+    errors = {"camera": 0.05, "projector": 0.07, "stereo": 0.061}
+    fit = StereoFit(("pose_01",), {"pose_02": "moved"}, errors, {}, {}, 180.0)
+    record = ModelCalibration(fit=fit, verdict=Verdict.of([blurred]))
+    monkeypatch.setattr("slviewer.pipeline.models.describe_default_model", lambda _: "default")
+    printed = []
+    for options in (CalibrateOptions(), CalibrateOptions(verbose=True)):
+        arguments = {"session": "here", "json": None, **vars(options)}
+        run_calibrate(lambda session: Findings(ModelCalibration, {"stereo": record}), arguments)
+        printed.append(capsys.readouterr().out)
+    short, full = printed
+    assert short.startswith("verdict: doubtful") and len(short.splitlines()) == 6
+    assert not missing_facts(short, "pose_03 is blurred", "0.061", "pose_02: moved")
+    assert "180.00" in full and "180.00" not in short
 
 
 def test_verify_a_plane_inside_and_a_sphere(
