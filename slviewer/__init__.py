@@ -5,7 +5,7 @@ a folder that holds captures and results, work `import_captures`, `calibrate`, `
 `verify`, `merge`, `mesh` and `measure`, named after their commands. On arrays, without a session,
 work `read_captures`, `decode`, `detect_board`, `calibrate_frames`, `reconstruct_cloud`,
 `evaluate_plane`, `evaluate_sphere`, `align_clouds`, `fuse_clouds`, `mesh_cloud`, `draw_error_maps`
-and `write_ply`.
+and `write_ply`. `show` opens a cloud, a merge or a mesh in a 3D view.
 
 Conventions, the same everywhere:
 
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from slviewer.fringe.phase import PhaseMap, Reason
     from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
     from slviewer.fringe.sequence import Frame, PatternSequence, one_axis
+    from slviewer.gui.viewer import show
     from slviewer.pipeline import datasets
     from slviewer.pipeline.accept import accept, check
     from slviewer.pipeline.batch import batch
@@ -140,6 +141,7 @@ _EXPORTS = {
     "reconstruct_cloud": "reconstruction.reconstruct",
     "run_plan": "pipeline.inspect_parts",
     "save_calibration": "pipeline.calibrate",
+    "show": "gui.viewer",
     "simulated_rig": "devices.simulated",
     "texture": "fringe.decode",
     "verify": "pipeline.reconstruct",
@@ -153,12 +155,12 @@ __all__ = [
     "PatternSequence", "PhaseMap", "Pose", "Quantity", "Reason", "Session", "SimulatedWorld",
     "SlviewerError", "Verification", "accept", "align", "align_clouds", "batch", "calibrate",
     "calibrate_frames", "capture", "capture_frames", "check", "compare", "complementary",
-    "datasets", "decode", "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere",
-    "examine", "export", "fuse_clouds", "gray", "import_captures", "import_cloud", "letter_rig",
-    "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro",
-    "multifrequency", "one_axis", "p18", "plugins", "read_captures", "read_ply", "reconstruct",
-    "reconstruct_cloud", "report", "run_plan", "save_calibration", "simulate", "simulated_rig",
-    "texture", "verify", "write_ply",
+    "datasets", "decode", "detect_board", "draw_error_maps", "evaluate_plane",
+    "evaluate_sphere", "examine", "export", "fuse_clouds", "gray", "import_captures",
+    "import_cloud", "letter_rig", "load_arrays", "load_calibration", "measure", "merge", "mesh",
+    "mesh_cloud", "micro", "multifrequency", "one_axis", "p18", "plugins", "read_captures",
+    "read_ply", "reconstruct", "reconstruct_cloud", "report", "run_plan", "save_calibration",
+    "show", "simulate", "simulated_rig", "texture", "verify", "write_ply",
 ]  # fmt: skip
 
 

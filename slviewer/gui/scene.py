@@ -445,14 +445,22 @@ class Viewpoints:
 def _look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
     """Move one browser's view to the points (..., 3) mm; nothing happens where none is valid."""
     flat = points.reshape(-1, 3)
-    flat = flat[np.isfinite(flat[:, 2])][:: max(1, len(flat) // 20_000)]
-    if not len(flat):
-        return
-    low, high = np.percentile(flat, [2, 98], axis=0)
+    flat = flat[np.isfinite(flat[:, 2])]
+    if len(flat):
+        size = _relative_size(client.camera)
+        _set_view(client, *frame_points(flat, client.camera.aspect, size))
+
+
+def frame_points(
+    points: np.ndarray, aspect: float, relative_size: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return camera position and target (3,) mm that show valid points (n, 3) in a view of that
+    width over height, whose field of view has a size relative to the perspective one."""
+    low, high = np.percentile(points[:: max(1, len(points) // 20_000)], [2, 98], axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     # the field of view is that of the height
-    away = max(1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0)
-    _set_view(client, middle + _FROM * away / _relative_size(client.camera), middle)
+    away = max(1.45 * size * max(1.0, 0.85 / aspect), 50.0)
+    return middle + _FROM * away / relative_size, middle
 
 
 def _relative_size(camera: viser.CameraHandle) -> float:
