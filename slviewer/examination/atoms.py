@@ -8,7 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.examination import limits
-from slviewer.fringe.levels import find_common_range
+from slviewer.fringe.levels import find_common_range, longest_range
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 
 
@@ -95,7 +95,8 @@ def _find_range(sequence: PatternSequence, axis: Axis) -> tuple[float, float, fl
     if extent < inf:
         span = max(limits.BEYOND * extent, periods[0])
         start = -0.5 - (span - extent) / 2
-        return start, start + span, step
+        unambiguous = min(longest_range(periods), limits.FAR_BEYOND * extent)
+        return start, start + max(span, unambiguous), step
     try:
         return -0.5, max(periods[0], find_common_range(periods)), step
     except InputError:

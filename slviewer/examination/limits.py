@@ -35,6 +35,8 @@ STEPS_PER_PERIOD = 18
 """Coordinates at which patterns are tabulated: between them a cosine is off by 0.4 %."""
 BEYOND = 1.25
 """Range of coordinates over the projector's size: beyond, beats of fine periods repeat."""
+FAR_BEYOND = 1.7
+"""The same where beats are longer: a projector may be larger than described."""
 BEYOND_CODE = 2.2
 """The same of a Gray code, whose cells may be half as wide as described."""
 NEAR = 6

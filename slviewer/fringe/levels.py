@@ -154,6 +154,11 @@ def unwrap_levels(
     return coordinate, order, turns
 
 
+def longest_range(periods_px: tuple[float, ...]) -> float:
+    """Return the longest of the periods and their beats, px."""
+    return max(periods_px[0], *(beat.period_px for beat in _list_beats(periods_px)), 0.0)
+
+
 def find_common_range(periods_px: tuple[float, ...]) -> float:
     """Return the range px after which all phases of the periods repeat, and within which
     coordinates are unambiguous.

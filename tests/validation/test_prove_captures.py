@@ -212,3 +212,11 @@ def test_a_tenth_of_the_captures_is_judged_as_well_as_measured() -> None:
     assert len(proof.rows) == 1 + len(CAPTURE_FAULTS)
     assert proof.holds, proof.text()
     assert not [case for case in proof.record["cases"] if case.outcome == "CRASH"]
+
+
+@pytest.mark.computes
+def test_beats_beyond_a_projector_that_is_stated_too_small_are_named() -> None:
+    # aliases of the stated size, 168 px off, agree with the beats that it needs
+    case = examine_case("projector too small", "micro", 1)
+    assert case.outcome == "right"
+    assert {named.cause for named in case.named} == {"projector-size"}
