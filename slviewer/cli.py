@@ -35,6 +35,7 @@ from slviewer.commands.runs import (
     run_calibrate,
     run_capture,
     run_preflight,
+    run_reproduce,
     run_turn,
     wizard,
 )
@@ -153,7 +154,11 @@ COMMANDS: dict[str, Callable[[], Function]] = {
     "accept": _define_command("pipeline.accept:accept", options=JSON),
     "fetch": _define_command("pipeline.datasets:fetch", "name", "folder", run=_run_fetch),
     "simulate": _define_command("pipeline.simulate:simulate", run=_run_simulate),
-    "reproduce": _define_command("validation.reproduce:reproduce", options=JSON),
+    "reproduce": _define_command(
+        "validation.reproduce:reproduce",
+        options=("commands.runs:ReproduceOptions", *JSON),
+        run=run_reproduce,
+    ),
     "prove": _define_command("validation.prove:prove", options=JSON, names={"cases": "case"}),
     "patterns": _define_command("pipeline.printouts:patterns"),
     "target": _define_command("pipeline.printouts:target", "board"),

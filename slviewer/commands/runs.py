@@ -246,6 +246,30 @@ def _summarise_calibration(found: Mapping[str, "ModelCalibration"]) -> str:
 
 
 @dataclass(frozen=True)
+class ReproduceOptions:
+    """What `reproduce` takes beside the parameters of its function.
+
+    Args:
+        clean: Compute nothing, and remove the session and the merged cloud of an earlier run from
+            the folder; its report stays.
+    """
+
+    clean: bool = False
+
+
+def run_reproduce(reproduce: Function, arguments: Arguments) -> None:
+    """Reproduce the Letter's experiments, saying first how much disk they take; or remove what an
+    earlier run left."""
+    if take_options(arguments, ReproduceOptions).clean:
+        from slviewer.validation.reproduce import choose_folder, clean_reproduction
+
+        folder = choose_folder(arguments["out"], arguments["quick"])
+        terminal.print_result(clean_reproduction(folder))
+    else:
+        show_result(reproduce, {**arguments, "say": terminal.print_message})
+
+
+@dataclass(frozen=True)
 class SLStudioOptions:
     """What was shown.
 

@@ -72,6 +72,12 @@ class SimulatedRig:
         return self.projector.project(np.asarray(points, float) @ self.R.T + self.t)
 
 
+def check_scale(scale: float) -> None:
+    """Raise InputError for a resolution that `letter` does not simulate."""
+    if not 0.05 <= scale <= 4:
+        raise InputError(f"the scale {scale:g} is not between 0.05 and 4: 1 is the full 1600x1200")
+
+
 def letter(
     scale: float = 1.0,
     seed: int = 0,
@@ -89,8 +95,7 @@ def letter(
     wavelengths: 0.3 ... 0.8 of the width, or 0.15 ... 0.4. `gamma` and `flicker` replace the
     preset's (1: a linearised projector; 0: a steady lamp).
     """
-    if not 0.05 <= scale <= 4:
-        raise InputError(f"the scale {scale:g} is not between 0.05 and 4: 1 is the full 1600x1200")
+    check_scale(scale)
     if local_distortion_px is not None and not 0 <= local_distortion_px <= 5:
         raise InputError(
             f"a local distortion of {local_distortion_px:g} px is not between 0 and 5 px"

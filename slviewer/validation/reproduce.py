@@ -38,9 +38,14 @@ from slviewer.report.reproduction import (
 )
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
+from slviewer.simulation.rig import check_scale
 
 MODELS = ("stereo", "pixelwise", "splined")
 QUICK_SCALE = 0.5
+SESSION, MERGED = "session", "merged.ply"
+FULL_SIZE = (1600, 1200)
+BYTES_PER_PIXEL = 2200
+"""Of the disk, per pixel of the camera: 2051 at scale 0.5, 2311 at 0.25."""
 PIXEL = (500, 500)
 """Where the Letter shows its curves, at full resolution."""
 OBJECTS = ("object_r1", "object_r2", "object_r3")
@@ -105,8 +110,7 @@ class Reproduction:
             for name, pair in self.merged.record.pairs.items()
         ]
         size = "x".join(map(str, self.stereo.rig.camera.size))
-        session = self.report.parent / "session"
-        used_gb = sum(f.stat().st_size for f in session.rglob("*") if f.is_file()) / 1e9
+        session = self.report.parent / SESSION
         return "\n".join(
             [
                 f"Simulated rig, camera {size}, {len(self.stereo.poses)} target poses. RMS in mm.",
@@ -130,7 +134,7 @@ class Reproduction:
                 *pairs,
                 "",
                 f"Report: {self.report}",
-                f"Session: {session} ({used_gb:.1f} GB)",
+                f"Session: {session} ({measure_disk_gb(session):.1f} GB)",
             ]
         )
 
@@ -141,6 +145,7 @@ def reproduce(
     quick: bool = False,
     scale: float | None = None,
     seed: int = 0,
+    say: Warn = ignore_warnings,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Reproduction:
@@ -153,14 +158,17 @@ def reproduce(
         out: Folder for the session and the report; by default reproduction, or reproduction-quick.
         seed: Another seed is another rig of the same kind.
 
-    The session stays in ``out/session``, and serves the next run with the same settings.
+    The session stays in ``out/session``, and serves the next run with the same settings. ``say`` is
+    called with the disk space that this takes before anything is computed.
     """
-    out = Path(out or ("reproduction-quick" if quick else "reproduction"))
-    session = out / "session"
+    out = choose_folder(out, quick)
+    session = out / SESSION
     if scale is None:
         scale = QUICK_SCALE if quick else 1.0
     elif quick:
         raise UsageError(f"--quick is --scale {QUICK_SCALE:g}: give one of both")
+    check_scale(scale)
+    say(_check_disk(out, scale))
     _simulate(session, scale, seed, part(progress, 0.0, 0.4))
     calibrate.run(session, CalibrateSettings(TARGET, MODELS), part(progress, 0.4, 0.65), warn)
     with Session.open(session) as store:
@@ -182,7 +190,7 @@ def reproduce(
             )
             comparisons.append({each.capture.name: each.found for each in compared})
         planes, spheres = comparisons
-        settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
+        settings = MergeSettings(OBJECTS, OBJECTS[-1], out / MERGED, "pixelwise")
         with merge_scans(Job(store, part(progress, 0.82, 0.9)), settings) as merged:
             spacings = _compare_spacings(session, spheres)
     result = Reproduction(
@@ -202,6 +210,53 @@ def reproduce(
     write_page(result.report, *reproduction_title(data), headlines, sections)
     progress(1.0, "reproduced")
     return result
+
+
+def choose_folder(out: Path | str | None, quick: bool) -> Path:
+    """Return the folder of the session and the report: the given one, else one of the working
+    folder."""
+    return Path(out or ("reproduction-quick" if quick else "reproduction"))
+
+
+def clean_reproduction(out: Path) -> str:
+    """Remove the session and the merged cloud that `reproduce` left in a folder, and return what
+    was removed. The report stays.
+
+    Raises InputError where the folder holds no session that was simulated for this.
+    """
+    session = out / SESSION
+    if not _load_truth(session):
+        raise InputError(
+            f"{out} holds no session of an earlier run: give its folder with --out, or --quick"
+        )
+    used_gb = measure_disk_gb(out)
+    shutil.rmtree(session)
+    (out / MERGED).unlink(missing_ok=True)
+    return f"{used_gb - measure_disk_gb(out):.1f} GB removed from {out}"
+
+
+def measure_disk_gb(folder: Path) -> float:
+    """Return the size of all files in a folder, GB."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / 1e9
+
+
+def _check_disk(out: Path, scale: float) -> str:
+    """Return how much disk space the results take, and where. Raises InputError where there is too
+    little."""
+    there = next(each for each in (out.absolute(), *out.absolute().parents) if each.is_dir())
+    free_gb = shutil.disk_usage(there).free / 1e9
+    width, height = (scale * side for side in FULL_SIZE)
+    needed_gb = BYTES_PER_PIXEL * width * height / 1e9
+    missing_gb = needed_gb - (measure_disk_gb(out) if out.is_dir() else 0.0)
+    if missing_gb > free_gb:
+        raise InputError(
+            f"The session takes about {needed_gb:.1f} GB, and {free_gb:.1f} GB are free at {there}:"
+            " choose another folder with --out, or --quick"
+        )
+    return (
+        f"The session takes about {needed_gb:.1f} GB in {out.absolute()} ({free_gb:.0f} GB are"
+        " free); --clean removes it"
+    )
 
 
 def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> None:

@@ -4,15 +4,17 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 from copies import copy_session
-from facts import missing_facts
+from facts import missing_facts, raises
 from small_fields import fit_few_cells
 
 from slviewer.commands.runs import CalibrateOptions, run_calibrate
+from slviewer.errors import InputError
 from slviewer.pipeline.models import load_stereo
 from slviewer.pipeline.operation import Findings
 from slviewer.records.calibration import ModelCalibration, StereoFit
@@ -20,6 +22,7 @@ from slviewer.records.verdict import Finding, Verdict
 from slviewer.session.exporters import write_calibration
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
+from slviewer.validation.reproduce import reproduce
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -235,6 +238,34 @@ def test_reproduce_remakes_the_letters_tables_and_figures(
     assert page.count("data:image/webp;base64") >= 14 and "http://" not in page.replace(
         "http://www.w3.org", ""
     )
+
+
+def test_reproduce_says_how_much_disk_it_takes_and_cleans_it(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Started(Exception):
+        """Raised in place of the simulation."""
+
+    def stop(*_: object, **__: object) -> None:
+        raise Started
+
+    monkeypatch.setattr("slviewer.validation.reproduce._simulate", stop)
+    said: list[str] = []
+    with pytest.raises(Started):
+        reproduce(tmp_path / "rep", quick=True, say=said.append)
+    assert not missing_facts(said[0], "1.1 GB", tmp_path / "rep", "--clean")
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1e9))
+    with raises(InputError, "4.2 GB", "1.0 GB", "--quick"):
+        reproduce(tmp_path / "rep")
+    session, report = tmp_path / "rep" / "session", tmp_path / "rep" / "report.html"
+    session.mkdir(parents=True)
+    (tmp_path / "rep" / "merged.ply").write_bytes(bytes(10**8))
+    report.touch()
+    status, _, _ = run("reproduce", "--clean", "--out", tmp_path / "rep")
+    assert status == 1 and session.exists()  # nothing shows that this program made it
+    (session / "truth.json").write_text('{"scale": 0.5}')
+    status, text, _ = run("reproduce", "--clean", "--out", tmp_path / "rep")
+    assert status == 0 and "0.1 GB" in text and list(report.parent.iterdir()) == [report]
 
 
 @pytest.mark.slow
