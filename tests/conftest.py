@@ -12,6 +12,7 @@ for library in ("OMP", "OPENBLAS", "NUMBA"):
 import gc
 import json
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -27,6 +28,8 @@ from small_fields import fit_few_cells
 os.environ["SLVIEWER_NO_PREPARATION"] = (
     "1"  # wizards that tests start compile what they use, and nothing beside it
 )
+# of wizards that tests start
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="slviewer-state-")
 sys.dont_write_bytecode = False  # what tests start as processes need not compile the sources again
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 

@@ -506,7 +506,8 @@ def wizard(
     the same.
 
     Args:
-        session: Session folder, made if it does not exist; by default slviewer-session, here.
+        session: Session folder, made if it does not exist; by default the page begins with the
+            recent sessions, and makes new ones in the folder slviewer of your documents.
         rig: simulated (half resolution), simulated:0.25 or a driver; by default that of the
             session, else simulated.
         address: Where and how to serve the page.

@@ -26,12 +26,12 @@ from slviewer.server.access import ONE_TIME_SECONDS, ROLES
 from slviewer.server.device_pages import serve_device_pages
 from slviewer.server.secure import SafeServer, Serving, serve
 from slviewer.server.viser_internals import ViserClient
+from slviewer.session.recent import RecentSessions, sessions_folder, state_file
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.preparation import Preparation
 
 DRAWN_PER_S = 10.0
-DEFAULT_SESSION = "slviewer-session"
 _BRAND = (25, 113, 194)
 
 
@@ -45,19 +45,23 @@ class App:
         *,
         pages: PageChannels | None = None,
         print_links: Callable[[SafeServer], None] = lambda _: None,
+        recent: RecentSessions | None = None,
     ) -> None:
         """Serve `operator`, and the pages of devices if `pages` is given, those that its rigs are
         set up with.
 
-        `print_links` is called when the links were replaced. Raises SlviewerError where it cannot
-        be served.
+        `print_links` is called when the links were replaced. `recent`: sessions on the start page,
+        to which those that are opened are added; by default these alone. Raises SlviewerError where
+        it cannot be served.
         """
         self.operator = operator
         self.server: SafeServer = serve(serving)
         try:
             if pages:
                 serve_device_pages(self.server, pages)
-            self._context = PanelContext(operator, self.server, pages, print_links)
+            self._context = PanelContext(
+                operator, self.server, pages, print_links, recent or RecentSessions()
+            )
             page = self.server.viser
             page.gui.configure_theme(brand_color=_BRAND, control_width="large")
             page.initial_camera.position, page.initial_camera.look_at = OVERVIEW
@@ -120,6 +124,8 @@ class App:
         if folder != self._folder:
             self._folder = folder
             self.server.downloads.clear()
+            if folder:
+                self._context.recent.add(folder)
         if snapshot.version != self._version or self.shell.needs_drawing:
             with self._context.lock, self.server.viser.atomic():
                 self.shell.update(snapshot)
@@ -151,14 +157,15 @@ def run(
     serving: Serving | None = None,
     open_browser: bool = True,
 ) -> None:
-    """Serve the wizard until Ctrl-C. `rig` as in `rig_choice`; empty: the session's, else the
-    simulated one.
+    """Serve the wizard until Ctrl-C, with its start page where no session is given. `rig` as in
+    `rig_choice`; empty: the session's, else the simulated one.
 
     Raises SlviewerError where the session, the rig or the address cannot be used.
     """
     pages = PageChannels()
     with Operator(set_up=partial(set_up, pages=pages)) as operator:
-        _check_granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
+        if session:
+            _check_granted(operator, operator.open_session(session))
         store = operator.session
         remembered = store is not None and (store.valid_decision("rig") or store.decision_faults())
         # a remembered rig that is not connected now is not replaced by the simulated one
@@ -166,13 +173,18 @@ def run(
             _check_granted(
                 operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session))
             )
-        app = App(operator, serving or Serving(), pages=pages, print_links=print_links)
+        recent = RecentSessions(state_file())
+        app = App(
+            operator, serving or Serving(), pages=pages, print_links=print_links, recent=recent
+        )
         preparation = Preparation(lambda share: operator.show(preparing=share))
         preparation.start()
         with contextlib.ExitStack() as ended:
             ended.callback(app.close)
             ended.callback(preparation.close)
             try:
+                if session is None:
+                    print(f"New sessions are made in {sessions_folder()}.")
                 print_links(app.server)
                 if open_browser:
                     ended.enter_context(browser_opened(app.server))

@@ -20,6 +20,7 @@ from slviewer.errors import InputError, hide_passwords
 from slviewer.gui.scene import Colour, ViewerScene, Viewpoints
 from slviewer.gui.widgets import NOTICES, link, paragraph
 from slviewer.server.secure import SafeServer
+from slviewer.session.recent import RecentSessions
 from slviewer.session.store import Session
 from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.operator import Operator
@@ -54,7 +55,8 @@ class PanelContext:
     `gui` builds inputs, `scene` draws in 3D, `viewpoints` moves the browsers' views, `operator`
     takes requests. `lock` is held by whatever reads or changes the panels: drawing, callbacks, and
     the pictures that a painter shows. `pages` are the pages of devices; None where none is served.
-    `print_links` is called when the links were replaced.
+    `print_links` is called when the links were replaced. `recent` are the sessions of the start
+    page.
     """
 
     def __init__(
@@ -63,9 +65,10 @@ class PanelContext:
         server: SafeServer,
         pages: PageChannels | None,
         print_links: Callable[[SafeServer], None],
+        recent: RecentSessions,
     ) -> None:
         self.operator, self.server, self.pages = operator, server, pages
-        self.print_links = print_links
+        self.print_links, self.recent = print_links, recent
         self.gui, self.scene = server.viser.gui, ViewerScene(server.viser, self.submit)
         self.viewpoints = Viewpoints(server.viser)
         self._pass_on = start_worker("slviewer requests")

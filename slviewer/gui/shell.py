@@ -20,6 +20,7 @@ from slviewer.calibration.next_pose import nominal_lens
 from slviewer.evaluation.render import format_counts
 from slviewer.gui.panel import NO_SESSION, ButtonColour, ControlGroup, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
+from slviewer.gui.start import START, StartPanel
 from slviewer.gui.widgets import (
     NOTICES,
     STEPS_PAGE,
@@ -81,7 +82,7 @@ class Shell(ControlGroup):
         self._panels: dict[str, StepPanel] = {}
         self._shown_key = self._autopilot_key = self._following_key = ""
         self._folder: Path | None = None
-        self.current = find_first_step(steps)
+        self.current = START
         """The step that is shown, or will be with the next drawing."""
         self._gui.set_panel_label("slviewer")
         self._build_left(steps)
@@ -99,6 +100,9 @@ class Shell(ControlGroup):
         gui = self._gui
         gui.main_panel.dock_left()
         gui.main_panel.set_width(STEPS_PX)
+        self._start_button = self.button(
+            "Sessions", partial(self.go, START), "folder-open", hint="New, recent and others"
+        )
         self._step_buttons = {
             step.key: self.button(
                 f"{number}. {step.title}", partial(self.go, step.key), _ICONS[step.state]
@@ -130,17 +134,12 @@ class Shell(ControlGroup):
                 "Continue", lambda: self.go(self._following_key), "arrow-right", None
             )
             self._cancel.visible = self._next.visible = False
+            self._panels[START] = StartPanel(self.context, self._leave_start)
             for key in (step.key for step in steps):
                 module = importlib.import_module(f"slviewer.gui.steps.{key}")
                 self._panels[key] = getattr(module, f"{key.title()}Panel")(self.context)
         with panel.add_tab("Session"):
             self._session = Text(gui)
-            self._path = gui.add_text(
-                "Folder", "", hint="Of another session; created if it does not exist"
-            )
-            self.button(
-                "Open session", lambda: operator.open_session(self._path.value), "folder-open"
-            )
             links = gui.add_button(
                 "Links",
                 icon=viser.Icon.LINK,
@@ -157,14 +156,15 @@ class Shell(ControlGroup):
 
     def update(self, snapshot: Snapshot) -> None:
         """Update the page from a snapshot."""
-        if snapshot.session and snapshot.session.folder != self._folder:
-            self._folder = snapshot.session.folder
-            if snapshot.step(self.current).state == "blocked":  # in another session
-                self.go(find_first_step(snapshot.steps))
+        folder = snapshot.session.folder if snapshot.session else None
+        if folder != self._folder:
+            self._folder = folder
+            self.current = next_step(snapshot) if folder else START
         self._follow_autopilot(snapshot)
         key = self.current
         if key != self._shown_key:
             self._switch_panel(key)
+        self._start_button.color = None if key == START else "gray"
         for step in snapshot.steps:
             button = self._step_buttons[step.key]
             button.icon = viser.IconName(_ICONS[step.state])
@@ -207,6 +207,10 @@ class Shell(ControlGroup):
 
     def _draw_heading(self, snapshot: Snapshot) -> None:
         """Show the step's title, state, instruction and problems, and the button to continue."""
+        if self._shown_key == START:
+            self._heading.set("")
+            self._next.visible = False
+            return
         steps = list(snapshot.steps)
         at = next(i for i, step in enumerate(steps) if step.key == self._shown_key)
         step = steps[at]
@@ -256,8 +260,8 @@ class Shell(ControlGroup):
         notices."""
         session, space = snapshot.session, snapshot.space
         if session is None:
-            about = alert("No session is open: enter a folder.", "warning")
-            self._counts.set(note("No session is open.", "warning"))
+            about = note("No session is open.")
+            self._counts.set(about)
         else:
             kinds = ["pose"] * len(session.poses) + [scan.purpose for scan in session.scans]
             name = f'<b style="overflow-wrap:anywhere">{to_html(session.folder.name)}</b>'
@@ -277,7 +281,7 @@ class Shell(ControlGroup):
         rest = f"{more} more files are damaged: `slviewer inspect` lists them." if more > 0 else ""
         texts = (snapshot.read_failure, *faults[:_MOST_FAULTS], rest)
         self._faults.set("".join(alert(text, "error") for text in texts))
-        self._autopilot.visible = snapshot.rig.simulated
+        self._autopilot.visible = snapshot.rig.simulated and session is not None
         self._autopilot.label = "Stop autopilot" if snapshot.autopilot else "Autopilot"
         self._autopilot_status.write(snapshot.autopilot, "info")
         latest = ""
@@ -309,6 +313,10 @@ class Shell(ControlGroup):
 
     # requests
 
+    def _leave_start(self) -> None:
+        """Show the first step that is not done, of the session that was opened."""
+        self._folder = None
+
     def _toggle_autopilot(self) -> None:
         """Start the autopilot, or stop it where it runs."""
         if self._operator.snapshot().autopilot:
@@ -317,9 +325,14 @@ class Shell(ControlGroup):
             self._operator.start_autopilot(Autopilot(self._operator, pause_s=0.5))
 
 
-def find_first_step(steps: Sequence[StepView]) -> str:
-    """Return the key of the first step that is not done, else of the first one."""
-    return next((step.key for step in steps if step.state != "done"), steps[0].key)
+def next_step(snapshot: Snapshot) -> str:
+    """Return the key of the step after the last one that is done, else the last one; a rig that is
+    being opened counts as done."""
+    steps = snapshot.steps
+    done = [i for i, step in enumerate(steps) if step.state == "done"]
+    if snapshot.rig.state == "opening":
+        done.append(0)
+    return steps[min(max(done, default=-1) + 1, len(steps) - 1)].key
 
 
 def autopilot_step(snapshot: Snapshot) -> str:

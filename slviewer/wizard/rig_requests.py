@@ -13,15 +13,18 @@ from slviewer.devices.capture import check_exposures
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import DamagedError, DeviceError, InputError, SlviewerError
+from slviewer.evaluation.render import format_count
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture import choose_sequence, depth_axis
 from slviewer.pipeline.check_results import CheckVerdict, Preflight
+from slviewer.pipeline.duplicate import duplicate_calibration
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.rig_choice import Choice, RigSetup, save_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, ExposureSuggestion, suggest_exposure
 from slviewer.preflight.check_rig import preflight
 from slviewer.session.reading import expand_user
+from slviewer.session.recent import unused_folder
 from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
@@ -43,9 +46,11 @@ class RigRequests(Engine):
     """Requests about the session, the devices, the target and the patterns."""
 
     @request("Opening the session")
-    def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
+    def open_session(
+        self, path: Path | str, rig: Choice | None = None, *, is_new: bool = False
+    ) -> None:
         """Open or create a session for writing, with `rig`, else the one that it remembers, else
-        the one in use.
+        the one in use. ``is_new``: only where there is none yet.
 
         Jobs of the previous session are cancelled. If the remembered rig is not connected, the
         session opens without. Where the session is open already, only the rig changes.
@@ -59,11 +64,12 @@ class RigRequests(Engine):
                     " session"
                 )
             before = self.session
-            if before and expand_user(path).resolve() == before.folder.resolve():
+            is_open = before and expand_user(path).resolve() == before.folder.resolve()
+            if before and is_open and not is_new:
                 if rig:
                     self._restore_rig(before, rig)
                 return
-            store = Session.open_or_create(path)
+            store = Session.create(path) if is_new else Session.open_or_create(path)
             self._acquisition.stop_stream()
             self._jobs.cancel_all()
             self._session_reader, self._queued = SessionReader(store, self._planner), set()
@@ -80,6 +86,17 @@ class RigRequests(Engine):
                 self._restore_rig(store, rig)
             finally:
                 self._update_board()
+
+    @request("Duplicating the calibration")
+    def duplicate_calibration(self, folder: Path) -> None:
+        """Make a session with the calibration of another one, beside it, and open it."""
+        target = unused_folder(folder)
+        poses = duplicate_calibration(folder, target)
+        if self.open_session(target):
+            count = format_count(len(poses), "pose")
+            self._notices.add(
+                "good", f"{target.name} has the calibration of {folder.name}, from {count}"
+            )
 
     @request("Choosing the rig")
     def choose_rig(self, choice: Choice) -> None:

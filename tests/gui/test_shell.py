@@ -187,10 +187,10 @@ def test_browser_opens_one_time_link_from_private_file(
 def test_invalid_session_folder_is_reported(opened: Opened, tmp_path: Path) -> None:
     (tmp_path / "a file").write_text("not a session")
     page = opened.page
-    open_tab(page, "Session")
+    click(page, "Sessions")
+    page.get_by_text("Another folder", exact=True).click()
     opened.enter("Folder", str(tmp_path / "a file"))
     click(page, "Open session")
-    open_tab(page, "Step")
     expect(
         page.get_by_role("alert").filter(has_text="Error").filter(has_text="a file").first
     ).to_be_visible()
