@@ -36,6 +36,9 @@ BAND_BYTES = 2**27
 there are."""
 MIN_POSES = 4
 """One pose more than coefficients, so that the fit's RMS is meaningful."""
+POSES_FOR_PIXELWISE = 8
+"""With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better
+default."""
 _UNSOLVED = (np.nan,) * 5
 MAX_EXTRAPOLATION = 1.5
 """Largest extrapolation beyond a pixel's calibrated phase range, in lengths of that range."""

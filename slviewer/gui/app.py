@@ -10,7 +10,7 @@ import webbrowser
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import viser
 
@@ -30,6 +30,7 @@ from slviewer.session.recent import RecentSessions, sessions_folder, state_file
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.preparation import Preparation
+from slviewer.wizard.snapshot import Level, Snapshot
 
 DRAWN_PER_S = 10.0
 _BRAND = (25, 113, 194)
@@ -129,15 +130,27 @@ class App:
         if snapshot.version != self._version or self.shell.needs_drawing:
             with self._context.lock, self.server.viser.atomic():
                 self.shell.update(snapshot)
-            for notice in snapshot.notices:
-                if notice.number > self._notified:
-                    self._notified = notice.number
-                    self._context.notify(notice.level, notice.text)
+            self._notify(snapshot)
         self._version = snapshot.version
         if preview and preview.number != self._number:
             with self._context.lock:
                 self.shell.draw_preview(preview)
             self._number = preview.number
+
+    def _notify(self, snapshot: Snapshot) -> None:
+        """Show the gravest of the new notices that the page does not state, and how many more there
+        are."""
+        new = [
+            each
+            for each in snapshot.notices
+            if each.number > self._notified and not self.shell.states(each)
+        ]
+        if snapshot.notices:
+            self._notified = snapshot.notices[-1].number
+        if new:
+            worst = max(new, key=lambda each: (get_args(Level).index(each.level), each.number))
+            more = f" ({len(new) - 1} more: see Messages)" if len(new) > 1 else ""
+            self._context.notify(worst.level, f"{worst.text}{more}")
 
     def _greet_client(self, client: viser.ClientHandle) -> None:
         """Show a browser that may only watch that it cannot change anything, and an operator's what

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 import viser
@@ -27,6 +27,8 @@ from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import ExportView, Level, PreviewView, ScanView, SessionView, Snapshot
 
 NOTHING = "–"
+LONGEST_TOAST = 240
+"""Characters of a notification."""
 TYPING_S = 1.0
 """An input counts as entered after so long without a keystroke."""
 NO_SESSION = SessionView(Path(), "", "")
@@ -73,6 +75,8 @@ class PanelContext:
         self.viewpoints = Viewpoints(server.viser)
         self._pass_on = start_worker("slviewer requests")
         self.lock = threading.RLock()
+        self._toasts: dict[int, viser.NotificationHandle] = {}  # the latest of each browser
+        self._toast = 0, 0.0  # rank of the latest one's level, and when it ends
 
     @property
     def session(self) -> Session:
@@ -88,12 +92,24 @@ class PanelContext:
     # what is shown in the browsers
 
     def notify(self, level: Level, text: str) -> None:
-        """Show a notification in every browser."""
+        """Show a notification in every browser in place of the one before, unless that one is
+        graver and still shown."""
         title, colour, seconds, _ = NOTICES[level]
-        for client in self.server.viser.get_clients().values():
-            client.add_notification(
-                title, hide_passwords(text), color=colour, auto_close_seconds=seconds
-            )
+        rank, now = get_args(Level).index(level), time.monotonic()
+        text = hide_passwords(text)
+        if len(text) > LONGEST_TOAST:
+            text = f"{text[:LONGEST_TOAST].rsplit(' ', 1)[0]} … (see Messages)"
+        with self.lock:
+            toasts, (before, until) = self._toasts, self._toast
+            if rank < before and now < until:
+                return
+            self._toast = rank, now + seconds
+            for client in self.server.viser.get_clients().values():
+                if client.client_id in toasts:
+                    toasts[client.client_id].remove()
+                toasts[client.client_id] = client.add_notification(
+                    title, text, color=colour, auto_close_seconds=seconds
+                )
 
     def report_failure(self, error: BaseException) -> None:
         """Show an error as a notification in every browser."""

@@ -39,6 +39,7 @@ from slviewer.session.atomic import format_bytes
 from slviewer.wizard.autopilot import Autopilot
 from slviewer.wizard.snapshot import (
     CalibrationView,
+    Notice,
     PreviewView,
     RigView,
     SessionView,
@@ -65,6 +66,7 @@ STAGES = {
     "export": "measurements",
 }
 """{step: anchor of the findings of its stage in the help}."""
+_STATED = ("target-poses", "calibration")  # sections whose warnings are in their step's panel
 _HELP_STYLE = "float:right;font-size:0.875rem;line-height:1.9rem"
 _QUIET_ZONE = 4
 """White modules around a QR code (ISO/IEC 18004)."""
@@ -92,6 +94,12 @@ class Shell(ControlGroup):
         """Show another step at the next drawing; may be called from any thread."""
         if key in self._panels:
             self.current = key
+
+    def states(self, notice: Notice) -> bool:
+        """Whether the shown step states what a notice reports: results, and findings that have
+        their place in its panel."""
+        is_shown = notice.section == STAGES[self._shown_key or self.current]
+        return is_shown and (notice.level in ("info", "good") or notice.section in _STATED)
 
     # building
 
@@ -288,7 +296,8 @@ class Shell(ControlGroup):
         for notice in reversed(snapshot.notices[-_MOST_NOTICES:]):
             time = coloured(f"{notice.time:%H:%M}", "dim")
             text = coloured(notice.text, NOTICES[notice.level][3])
-            link = f" {help_link(notice.section)}" if notice.section else ""
+            is_fault = notice.section and notice.level in ("warning", "error")
+            link = f" {help_link(notice.section)}" if is_fault else ""
             latest += paragraph(Html(f"{time} {text}{link}"))
         style = "padding-top:0.6em;overflow-wrap:anywhere"
         self._latest.set(f'<div style="{style}">{latest or note("No messages.")}</div>')

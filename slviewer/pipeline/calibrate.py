@@ -15,7 +15,7 @@ from slviewer.calibration.diagnosis.evidence import Evidence
 from slviewer.calibration.diagnosis.rules import judge_evidence, judge_splined
 from slviewer.calibration.known_camera import UNSTATED_SIGMA, KnownCamera
 from slviewer.calibration.observe import Smoothing
-from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
+from slviewer.calibration.pixelwise import MIN_POSES, PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import (
@@ -392,19 +392,23 @@ def _fit_models(
         return CalibrationResult(stereo, verdict=verdict)
     if diagnosed.warning:
         warn(diagnosed.warning)
+    doubts = [finding for finding in verdict.findings if finding.severity == "doubtful"]
+    stated = {name for each in doubts for name in each.poses if name in each.sentence}
     for name, why in stereo.excluded.items():
-        if name not in excluded:
+        if name not in excluded and name not in stated:
             warn(f"{name} is excluded: {why}")
-    for finding in verdict.findings:
-        if finding.severity == "doubtful":
-            warn(finding.text())
+    few = next((finding for finding in doubts if finding.cause == "too-few-poses"), None)
     models = settings.models or MODELS
     pixelwise, splined, share = None, None, 0.0
     if "pixelwise" in models:
         share = 0.33 if "splined" in models else 1.0
-        with _warn_of_failure("pixel-wise", models, warn):
-            fitting = stage(progress, 0.0, share, "pixel-wise fit")
-            pixelwise = calibrate_pixelwise(observations, stereo, fitting)
+        if few and len(observations) < MIN_POSES and len(models) > 1:
+            more = replace(few, sentence=f"{few.sentence}; no pixel-wise model")
+            verdict = Verdict.of(more if each is few else each for each in verdict.findings)
+        else:
+            with _warn_of_failure("pixel-wise", models, warn):
+                fitting = stage(progress, 0.0, share, "pixel-wise fit")
+                pixelwise = calibrate_pixelwise(observations, stereo, fitting)
     if "splined" in models:
         with _warn_of_failure("splined", models, warn):
             fitting = stage(progress, share, 1.0, "joint adjustment")
@@ -415,7 +419,7 @@ def _fit_models(
                 warn(f"{name} is excluded from the splined model: it {why}")
             verdict = judge_splined(verdict, splined.bundle.noise, splined.bundle.camera)
     for finding in verdict.findings:
-        if finding not in diagnosed.verdict.findings:
+        if finding.severity != "note":
             warn(finding.text())
     if verdict.level == "rejected":
         return CalibrationResult(stereo, verdict=verdict)

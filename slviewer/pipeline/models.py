@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE, PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError, SessionError, SlviewerError
@@ -36,9 +36,6 @@ ModelName = str
 """stereo, pixelwise or splined."""
 MODELS = ("stereo", "pixelwise", "splined")
 VERDICT = "verdict/1"
-POSES_FOR_PIXELWISE = 8
-"""With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better
-default."""
 LENS_TOLERANCE = 1e-3
 """Share by which focus, zoom and aperture may differ from those of the calibration's poses."""
 COMPILED = "compiled/splined"

@@ -38,6 +38,32 @@
     },
   });
 })();
+// viser warns at every start, in a large box that stays, that the scene is drawn in software. It asks for the renderer's
+// name first: here it gets none, and one line says so, once in a browser.
+(() => {
+  const noted = "slviewer drawn in software";
+  const prototype = WebGL2RenderingContext.prototype;
+  const getExtension = prototype.getExtension;
+  prototype.getExtension = function (name) {
+    const extension = getExtension.call(this, name);
+    if (name !== "WEBGL_debug_renderer_info" || !extension) return extension;
+    const renderer = String(this.getParameter(extension.UNMASKED_RENDERER_WEBGL));
+    if (!/swiftshader|llvmpipe|softpipe|software/i.test(renderer)) return extension;
+    if (!localStorage.getItem(noted)) {
+      localStorage.setItem(noted, "yes");
+      const line = document.createElement("div");
+      line.setAttribute("role", "status");
+      line.textContent = "3D is drawn in software, slowly: switch on the browser's hardware acceleration.";
+      Object.assign(line.style, {
+        position: "fixed", bottom: "4px", left: "50%", transform: "translateX(-50%)", zIndex: "10",
+        font: "12px sans-serif", color: "#495057", background: "#ffffffd9", padding: "2px 8px", borderRadius: "4px",
+      });
+      document.body.append(line);
+      setTimeout(() => line.remove(), 12000);
+    }
+    return null;
+  };
+})();
 // viser writes the address of its WebSocket into the page's own, unless it has no path. Here every page has one, and the
 // address stays as it is.
 history.replaceState = () => {};

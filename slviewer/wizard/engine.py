@@ -16,7 +16,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.devices.world import SimulatedWorld
-from slviewer.errors import DamagedError, InputError, SessionError
+from slviewer.errors import CalibrationRejected, DamagedError, InputError, SessionError
 from slviewer.pipeline.capture import Space, measure_space, warn_of_captured
 from slviewer.pipeline.examination import load_examination, load_or_save_examination
 from slviewer.pipeline.feedback import Warn
@@ -192,22 +192,38 @@ class Engine:
     ) -> None:
         """Queue work on the session, which no longer saves once it was cancelled; what it returns
         becomes a notice, and `failed(error)` replaces that of a failure. ``section``: of the help,
-        of warnings."""
-        store, warn = self._store, self._warner(section)
+        of the notices. Warnings that the result states are not repeated."""
+        store, warnings = self._store, list[str]()
+
+        def add_warnings(stated: str = "") -> None:
+            """Add those of the work's warnings to the notices that are not stated."""
+            for text in dict.fromkeys(warnings):
+                if text not in stated:
+                    self._notices.add("warning", text, section)
 
         def done(found: Findings[Any] | str) -> None:
             """Add what the work found to the notices."""
-            if isinstance(found, str):
-                self._notices.add("good", found)
-            elif text := found.summary():
-                is_good = all(each.is_good for each in found.values())
-                self._notices.add("good" if is_good else "warning", text)
+            text = found if isinstance(found, str) else found.summary()
+            is_good = isinstance(found, str) or all(each.is_good for each in found.values())
+            add_warnings(text)
+            if text:
+                self._notices.add("good" if is_good else "warning", text, section)
+
+        def end_failed(error: BaseException) -> None:
+            """Add the warnings, and the failure; a verdict is stated in the section."""
+            add_warnings()
+            if failed:
+                failed(error)
+            elif isinstance(error, CalibrationRejected):
+                self._notices.add("error", str(error), section)
+            else:
+                self._notices.add_failure(title, error)
 
         self._jobs.submit(
             title,
-            lambda report: work(Job(store.guarded(report.saving), report, warn)),
+            lambda report: work(Job(store.guarded(report.saving), report, warnings.append)),
             done,
-            failed=failed,
+            failed=end_failed,
         )
 
     def _run(

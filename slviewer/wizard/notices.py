@@ -23,11 +23,15 @@ class Notices:
         self._count = 0
 
     def add(self, level: Level, text: str, section: str = "") -> None:
-        """Add a notice and log it, without passwords; `section`: of the help's page of findings."""
+        """Add a notice and log it, without passwords; one of the same text before it is removed.
+        `section`: of the help's page of findings."""
         text = hide_passwords(text)
         log.log(logging.getLevelNamesMapping().get(level.upper(), logging.INFO), "%s", text)
         with self._lock:
             self._count += 1
+            same = next((each for each in self._latest if each.text == text), None)
+            if same is not None:
+                self._latest.remove(same)
             self._latest.append(
                 Notice(self._count, level, text, datetime.now().astimezone(), section)
             )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.diagnosis.rules import FEW_POSES
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.evaluation.render import format_count
 from slviewer.inspection.regions import Region
@@ -126,10 +127,10 @@ class ResultRequests(Engine):
         target, models = self._reader.target(), ["stereo", "pixelwise"]
         if not target:
             raise InputError("choose the target first")
-        if missing := missing_for_splined(self._store):
-            self._warner("calibration")(f"no splined model: {missing}")
-        else:
+        if not (missing := missing_for_splined(self._store)):
             models.append("splined")
+        elif self._publisher.latest.content.good_poses >= FEW_POSES:  # else the verdict says so
+            self._warner("calibration")(f"no splined model: {missing}")
         before: Mapping[str, Any] = {}
         if "stereo" in available_models(self._store):
             before = load_record(self._store, ModelCalibration, "stereo").settings

@@ -9,12 +9,12 @@ import numpy as np
 
 from slviewer.calibration.next_pose import outline_px
 from slviewer.calibration.observe import Observation
+from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
 from slviewer.errors import DamagedError, SessionError
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
-    POSES_FOR_PIXELWISE,
     accepts_rejected,
     available_models,
     explain_board,

@@ -6,9 +6,9 @@ Everything here follows from the session's files and the rig.
 
 from collections.abc import Callable
 
+from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
 from slviewer.calibration.stereo import MIN_POSES
 from slviewer.evaluation.render import format_count
-from slviewer.pipeline.models import POSES_FOR_PIXELWISE
 from slviewer.records.merge import MIN_OVERLAP
 from slviewer.records.verification import Verification
 from slviewer.session.atomic import format_bytes
@@ -192,7 +192,7 @@ def _calibrate(now: Snapshot) -> Outlook:
                 f"{format_count(added, 'good pose')} captured after the calibration: calibrate"
                 " again to use them."
             )
-    if MIN_POSES <= n < POSES_FOR_PIXELWISE:
+    if calibration is None and MIN_POSES <= n < POSES_FOR_PIXELWISE:  # else its verdict says so
         problems.append(
             f"With fewer than {POSES_FOR_PIXELWISE} poses only the stereo model is reliable:"
             " capture more."

@@ -16,6 +16,7 @@ from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic
 from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY, CameraCheck, judge_camera
 from slviewer.calibration.observe import AXES
+from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.squareness import judge_squareness, nearest_aspect
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, MIN_TILT_SPREAD_DEG
@@ -471,13 +472,16 @@ def diagnose_pose_count(e: Evidence) -> Iterator[Finding]:
     needed = FEW_POSES_OF_PROJECTOR if e.is_camera_fixed else FEW_POSES
     if count >= needed:
         return
-    refused = [f"{pose.name}: {pose.refused}" for pose in e.poses if pose.refused]
-    because = f" ({'; '.join(refused[:3])})" if refused else ""
+    refused = {pose.name: pose.refused for pose in e.poses if pose.refused}
+    reasons = [f"{name}: {why}" for name, why in refused.items()][:3]
+    because = f" ({'; '.join(reasons)})" if refused else ""
+    wanted = needed if e.is_camera_fixed else POSES_FOR_PIXELWISE
     yield Finding(
         "too-few-poses",
         "rejected" if count < MIN_POSES else "doubtful",
         f"{count} usable pose{'s' * (count != 1)} of {len(e.poses)}{because}",
-        f"capture the board in more positions and tilts: {needed} at least, and a dozen is better",
+        f"capture the board in more positions and tilts: {wanted} poses at least",
+        tuple(refused)[:3],
     )
 
 
@@ -523,15 +527,17 @@ def diagnose_solution(e: Evidence) -> Iterator[Finding]:
             "check that the board is flat, in focus and held still, and look at the poses with the"
             " largest residuals",
         )
-    for device, sigma in e.solution.focal_sigma.items():
-        if not sigma < MAX_FOCAL_UNCERTAINTY:
-            yield Finding(
-                "uncertain",
-                "doubtful" if is_misfit or sigma < MAX_FOCAL_SIGMA else "rejected",
-                f"the poses, whose tilts differ by {e.solution.tilt_spread_deg:.0f} degrees, leave"
-                f" the {device}'s focal length uncertain by {100 * sigma:.1f} %",
-                "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
-            )
+    sigmas = e.solution.focal_sigma
+    uncertain = {device: s for device, s in sigmas.items() if not s < MAX_FOCAL_UNCERTAINTY}
+    if uncertain:
+        lengths = [f"the {device}'s by {100 * sigma:.1f} %" for device, sigma in uncertain.items()]
+        yield Finding(
+            "uncertain",
+            "doubtful" if is_misfit or max(uncertain.values()) < MAX_FOCAL_SIGMA else "rejected",
+            f"the poses, whose tilts differ by {e.solution.tilt_spread_deg:.0f} degrees, leave"
+            f" focal lengths uncertain: {' and '.join(lengths)}",
+            "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
+        )
 
 
 STAGES: tuple[tuple[Callable[[Evidence], Iterator[Finding]], ...], ...] = (

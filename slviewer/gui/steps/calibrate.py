@@ -29,7 +29,7 @@ from slviewer.gui.widgets import (
 )
 from slviewer.pipeline.report import calibration_view
 from slviewer.records.model_comparison import ModelComparison
-from slviewer.records.verdict import Finding, Verdict
+from slviewer.records.verdict import Cause, Finding, Verdict
 from slviewer.report.maps import PixelCurve, pixel_curves, rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
@@ -123,7 +123,8 @@ class CalibratePanel(StepPanel):
         if calibration is None:
             self._summary.set("")
             return
-        self._summary.set(exclusions_html(calibration) + _summary(calibration))
+        excluded = exclusions_html(calibration, session.verdict)
+        self._summary.set(excluded + _summary(calibration))
         if self._models_folder.visible:
             self._draw_models(calibration, snapshot.is_busy)
         states = ("used", "excluded", "unused")
@@ -158,6 +159,10 @@ class CalibratePanel(StepPanel):
             self._named.options = tuple(names[:_MOST_NAMED])
         self._named.visible = bool(names)
 
+    def _names_cause(self, cause: Cause) -> bool:
+        """Whether the verdict states this cause."""
+        return self.session.verdict is not None and cause in self.session.verdict.causes
+
     def _draw_models(self, calibration: CalibrationView, busy: bool) -> None:
         """Show the choice and the comparison of the models."""
         found = self.session.list_records(ModelComparison)
@@ -174,7 +179,7 @@ class CalibratePanel(StepPanel):
         splined = Html("")
         if calibration.splined:
             splined = report_table(calibration.splined.table())
-        elif calibration.missing:
+        elif calibration.missing and not self._names_cause("too-few-poses"):
             splined = note(f"No splined model: {calibration.missing}.")
         self._comparison.set(records_html(found) + splined)
 
@@ -401,12 +406,15 @@ def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) ->
     return tuple(dict.fromkeys(names))
 
 
-def exclusions_html(calibration: CalibrationView) -> Html:
-    """List excluded poses and features, each with its reason; empty where there are none."""
+def exclusions_html(calibration: CalibrationView, verdict: Verdict | None) -> Html:
+    """List excluded poses and features, each with its reason, but for the poses of which the
+    verdict states it; empty where there are none."""
     n = calibration.stereo.features_excluded
     text = f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma)"
     outliers = note(f"{text}: shadow or occlusion.")
-    lines = [f"{name}: {why}" for name, why in calibration.stereo.excluded.items()]
+    findings, excluded = verdict.findings if verdict else (), calibration.stereo.excluded.items()
+    stated = {name for each in findings for name in each.poses if name in each.sentence}
+    lines = [f"{name}: {why}" for name, why in excluded if name not in stated]
     if calibration.splined:
         lines += [
             f"{name}, in the splined model only: it {why}"

@@ -277,8 +277,6 @@ class PosesPanel(StepPanel):
             Html(f"<b>{to_html(pose.name)}</b>"),
             coloured(pose.state, _STATES[pose.state][0], bold=True),
         ]
-        if pose.why:
-            lines.append(to_html(pose.why))
         if pose.rms_px:
             camera, projector = pose.rms_px
             rms = f"Reprojection RMS: camera {camera:.3f} px, projector {projector:.3f} px"
