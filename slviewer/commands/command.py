@@ -56,6 +56,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "poses": (0, 1000),
     "seed": (0, (1 << 32) - 1),
     "smooth": (0, 1000),
+    "temperature": (-100, 200),
     "triangles": (1, 1e9),
     "wait_s": (1, LARGEST),
 }

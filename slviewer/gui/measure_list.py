@@ -22,7 +22,6 @@ from slviewer.gui.widgets import (
     paragraph,
     properties_table,
     records_html,
-    relabel,
     report_table,
     table,
     to_html,
@@ -41,6 +40,7 @@ from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
 from slviewer.records.inspection import RULE, Characteristic, CharacteristicResult, Inspection
 from slviewer.records.measurement import Measurement, list_quantities
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.table import relabel
 from slviewer.report.canvas import finish_figure, new_figure, style_axes
 from slviewer.report.page import Figure
 from slviewer.report.surfaces import draw_deviations, section_plot

@@ -24,10 +24,10 @@ from slviewer.gui.widgets import (
     records_html,
     table,
     to_html,
-    use_labels,
 )
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.merge import Merge
+from slviewer.records.table import use_labels
 from slviewer.registration.multiway import Pair
 from slviewer.registration.refusal import Reason
 from slviewer.registration.start import LEAST_PICKS, fit_picked_start

@@ -21,7 +21,7 @@ from scipy.io import wavfile
 
 from slviewer.errors import hide_passwords
 from slviewer.pipeline.stored_records import Stored, name_records
-from slviewer.records.table import Mark, Table
+from slviewer.records.table import Mark, Table, relabel
 from slviewer.report.page import Figure
 from slviewer.server.help_pages import PREFIX
 from slviewer.server.text import escape
@@ -201,25 +201,6 @@ def records_html(
     if stale := ", ".join(each.label for each in found if each.stale):
         html += note(f"Out of date, made from what has changed since: {stale}.", "warning")
     return Html(html)
-
-
-def relabel(shown: Table, labels: Mapping[str, str]) -> Table:
-    """Return a table with the operator's labels for the names of captures."""
-    rows = [
-        [use_labels(cell, labels) if isinstance(cell, str) else cell for cell in row]
-        for row in shown.rows
-    ]
-    return replace(shown, rows=rows, notes=[use_labels(note, labels) for note in shown.notes])
-
-
-def use_labels(sentence: str, labels: Mapping[str, str]) -> str:
-    """Replace the captures' names in a sentence by the operator's labels."""
-    names = [re.escape(name) for name, label in labels.items() if label != name]
-    return (
-        re.sub(rf"(?<![\w.-])({'|'.join(names)})(?![\w-])", lambda m: labels[m[1]], sentence)
-        if names
-        else sentence
-    )
 
 
 def link(address: str, text: str) -> Html:

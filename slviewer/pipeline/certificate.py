@@ -431,32 +431,20 @@ def certify_page(certificate: Certificate, page: str) -> str:
 def certificate_section(certificate: Certificate) -> Section:
     """Return what a certificate names, as a section of the report."""
     contents: dict[str, tuple[list[str], Rows]] = {
-        "Captures": (
-            ["capture", "role", "frames", "hash"],
-            [
-                [name, each.role, len(each.frames), each.hash]
-                for name, each in certificate.captures.items()
-            ],
-        ),
         "Calibrations and records": (
             ["result", "hash"],
             [[name, certificate.results[name]] for name in certificate.figures],
         ),
         "Software": (["software", "version"], [[*each] for each in certificate.software.items()]),
     }
-    notes = {
-        "Captures": [
-            "BLAKE2b, 160 bits, of frames and description; the hash of every single frame is kept"
-            " in this file."
-        ]
-    }
     text = (
-        "What the figures were computed from. `slviewer verify-report` reads this file and the"
-        " session, computes the figures again from the frames, and says whether they agree."
+        "What the figures were computed from, beside the captures. `slviewer verify-report` reads"
+        " this file and the session, computes the figures again from the frames, and says whether"
+        " they agree."
     )
     tables = [
-        Table([*map(Column, titles)], rows, caption, notes.get(caption, ()))
+        Table([*map(Column, titles)], rows, caption)
         for caption, (titles, rows) in contents.items()
         if rows
     ]
-    return Section("Certificate", text, tables)
+    return Section("Certificate", text, tables, is_annex=True)

@@ -1,12 +1,14 @@
 """What a session holds: as one self-contained HTML file; in words, and whether it is what was
 saved; and what is in its trash."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from slviewer.calibration.observe import Observation
@@ -17,7 +19,7 @@ from slviewer.evaluation.render import format_count, render
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.measure import describe_measurement, section_lines
 from slviewer.pipeline.models import (
     available_models,
@@ -28,8 +30,10 @@ from slviewer.pipeline.models import (
     preferred_model,
     recommended_model,
 )
+from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import describe_scale
+from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.pipeline.stored_records import (
     SessionLike,
     Stored,
@@ -40,9 +44,17 @@ from slviewer.pipeline.stored_records import (
     name_records,
     opened,
 )
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import normals
+from slviewer.records.acceptance import AcceptanceTest
 from slviewer.records.calibration import ModelCalibration
+from slviewer.records.drift import Drift
+from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
+from slviewer.records.merge import Merge
+from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.record import Record
 from slviewer.records.verification import Verification
 from slviewer.report.maps import PixelCurve, verification_maps
 from slviewer.report.page import Figure, write_page
@@ -51,16 +63,21 @@ from slviewer.report.session import (
     CaptureUse,
     RecordsView,
     SessionData,
+    make_title_page,
     session_headlines,
     session_sections,
     session_title,
 )
-from slviewer.report.surfaces import draw_deviation, section_plot
+from slviewer.report.surfaces import draw_deviation, draw_photo, draw_surface, section_plot
 from slviewer.session.capture import Capture
+from slviewer.session.ply import read_ply
+from slviewer.session.reading import expand_user, read_input
+from slviewer.session.report_details import encode_logo
 from slviewer.session.results import verify_result
 from slviewer.session.scan_edits import list_edits, load_region
 from slviewer.session.store import Session
 
+MAX_LOGO_BYTES = 1 << 24
 MOST_DRAWN = 6
 """Sections, and comparisons with nominal models, that are drawn, the last ones; the tables hold
 all."""
@@ -68,28 +85,60 @@ MOST_MAPS = 8
 """Verified captures whose error maps are drawn; the tables hold them all."""
 
 
-def report(
-    session: SessionLike,
-    out: Path | str,
-    *,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> str:
-    """Write one self-contained HTML report of a session.
+@dataclass(frozen=True)
+class ReportSettings(Callbacks):
+    """Where a report is written to, and what its title page states.
 
     Args:
         session: Session folder.
         out: The .html file.
-
-    Returns where it is, in words.
+        part: Name or number of the part. This and what follows is remembered in the session for
+            its next reports; empty text forgets it.
+        customer: Who the report is for.
+        order: Number of the order.
+        operator: Who measured.
+        temperature: Temperature of the room, °C.
+        logo: Image of a logo (PNG, JPEG or WebP).
     """
+
+    session: SessionLike
+    out: Path | str
+    _: KW_ONLY
+    part: str | None = None
+    customer: str | None = None
+    order: str | None = None
+    operator: str | None = None
+    temperature: float | None = None
+    logo: str | None = None
+
+    def changed_details(self) -> dict[str, Any]:
+        """Return the stated fields of `ReportDetails`."""
+        stated = {name: getattr(self, name) for name in ("part", "customer", "order", "operator")}
+        stated["temperature_c"] = self.temperature
+        if self.logo:
+            path = expand_user(self.logo)
+            content = read_input(path, MAX_LOGO_BYTES, "give an image file")
+            stated["logo"] = encode_logo(path.name, content)
+        elif self.logo is not None:
+            stated["logo"] = ""
+        return {name: value for name, value in stated.items() if value is not None}
+
+
+@takes_settings(ReportSettings)
+def report(settings: ReportSettings) -> str:
+    """Write one self-contained HTML report of a session: verdict and results first, then the
+    annex."""
+    out, progress = settings.out, settings.progress
     if Path(out).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{out} is not an HTML file: end its name in .html")
-    with opened(session) as store:
+    changed = settings.changed_details()
+    with opened(settings.session, write=bool(changed)) as store:
+        if changed:
+            store.save_report_details(msgspec.structs.replace(store.report_details(), **changed))
         progress(0.1, "reading the session")
         data = _collect_data(store)
         for message in data.warnings:
-            warn(message)
+            settings.warn(message)
         progress(0.4, "drawing")
         title, subtitle = session_title(data)
         progress(0.7, "reading the frames")
@@ -101,6 +150,7 @@ def report(
             session_headlines(data),
             [*session_sections(data), certificate_section(certificate)],
             partial(certify_page, certificate),
+            title_page=make_title_page(data),
         )
     progress(1.0, "written")
     return f"report written to {out}"
@@ -123,10 +173,13 @@ def _collect_data(store: Session) -> SessionData:
         pixel_fits = {axis: fit.rms_mm for axis, fit in pixelwise.fits.items()}
     judged = None if stereo is None else load_record(store, ModelCalibration, "stereo").verdict
     records, outdated = _collect_records(store)
+    known = _list_inputs(records, Verification, AcceptanceTest, Drift)
+    known |= {each.name for each in store.captures() if each.purpose in ("plane", "sphere")}
+    known -= _list_inputs(records, Merge, Inspection)
     region = load_region(store)
     return SessionData(
         name=store.folder.name,
-        captures=[_describe_use(c, stereo, excluded) for c in store.captures()],
+        captures=[_describe_use(c, stereo, excluded, known) for c in store.captures()],
         calibration=None if stereo is None else calibration_view(store),
         pixel_fits=pixel_fits,
         records=records,
@@ -142,7 +195,44 @@ def _collect_data(store: Session) -> SessionData:
             for scan in store.capture_names("scan")
             for words in list_edits(store, scan)[0]
         ],
+        labels=store.valid_decision("names") or {},
+        details=store.report_details(),
+        pictures=list(_draw_part(store, known)),
     )
+
+
+def _list_inputs(records: Sequence[RecordsView], *kinds: type[Record]) -> set[str]:
+    """Return the names of all inputs of the records of some kinds."""
+    views = [view for view in records if view.kind in kinds]
+    return {name for view in views for each in view.records.values() for name in each.inputs}
+
+
+def _draw_part(store: Session, known: Collection[str]) -> Iterator[Figure]:
+    """Yield pictures of the part: as the camera saw it, and the last merged surface, or that of the
+    first scan; none of ``known`` shapes."""
+    clouds = {each.name: each for each in list_records(store, Reconstruction) if not each.stale}
+    scans = [name for name in store.capture_names("scan") if name in clouds and name not in known]
+    merge = next((m.record for m in list_records(store, Merge)[::-1] if not m.stale), None)
+    if merge and merge.reference in scans:
+        scans.insert(0, merge.reference)
+    surface = None
+    for name in scans[:1]:
+        label, arrays = clouds[name].label, load_arrays(store, f"{Reconstruction.kind}/{name}")
+        if clouds[name].record.imported is None:
+            yield draw_photo(label, arrays["texture"], arrays["points"])
+        with suppress(InputError):  # all of it was deleted
+            cloud = Cloud(arrays["points"], "x", "", arrays["sigma_z"])
+            points = restrict_cloud(store, name, cloud, load_region(store)).points
+            is_known, facing = np.isfinite(points).all(axis=2), arrays.get("normals")
+            facing = normals(points) if facing is None else facing
+            surface = draw_surface(f"Surface of {label}", points[is_known], facing[is_known])
+    if merge:
+        with suppress(SlviewerError, OSError):  # its file was deleted
+            merged = read_ply(store.exports / merge.ply)
+            words = f"Merged surface of {format_count(len(merge.scans), 'scan')}"
+            surface = draw_surface(words, merged.points, merged.normals)
+    if surface:
+        yield surface
 
 
 def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
@@ -178,12 +268,15 @@ def _draw_records(store: Session, records: Sequence[Stored[Any]]) -> Iterator[Fi
 
 
 def _describe_use(
-    capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]
+    capture: Capture,
+    stereo: StereoModel | None,
+    excluded: Mapping[str, str],
+    known: Collection[str],
 ) -> CaptureUse:
-    """Return whether and why a capture is used or excluded."""
+    """Return whether and why a capture is used or excluded; ``known``: captures of known shapes."""
     name = capture.name
     if capture.role == "scan":
-        return CaptureUse(capture, "scan")
+        return CaptureUse(capture, "known shape" if name in known else "scan")
     if name in excluded:
         return CaptureUse(capture, "excluded", excluded[name])
     if stereo is None or not stereo.poses:

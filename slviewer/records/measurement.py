@@ -420,10 +420,10 @@ def list_quantities(found: Mapping[str, Measurement]) -> Table:
             Column("calibration in U", detail=True): (
                 None if q.U is None else "yes" if q.whole else "no"
             ),
-            Column("of", detail=True): each.where,
+            Column("of", detail=True): "" if k else each.where,
         }
         for name, each in found.items()
-        for q in each.quantities
+        for k, q in enumerate(each.quantities)
     ]
     partial = [
         name

@@ -135,8 +135,10 @@ def figure_column(name: str) -> Column:
 def list_shares(incidence: Mapping[str, float] | None) -> Row:
     """Return the percent in front of, inside and behind the calibrated depths by column."""
     return {
-        Column(depths, "%", "share in", digits=1, detail=True): (incidence or {}).get(depths)
-        for depths in DEPTHS
+        Column(where, "%", "of the calibrated depths", digits=1, detail=True): (
+            (incidence or {}).get(depths)
+        )
+        for depths, where in zip(DEPTHS, ("in front", "inside", "behind"), strict=True)
     }
 
 

@@ -1,6 +1,7 @@
 """Tables of figures with units: what the terminal, pages, panels and CSV files draw."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -179,6 +180,25 @@ class Table:
         return self.select(
             [c for k, c in enumerate(self.columns) if any(row[k] not in (None, "") for row in rows)]
         )
+
+
+def relabel(shown: Table, labels: Mapping[str, str]) -> Table:
+    """Return a table with the operator's labels for the names of captures."""
+    rows = [
+        [use_labels(cell, labels) if isinstance(cell, str) else cell for cell in row]
+        for row in shown.rows
+    ]
+    return replace(shown, rows=rows, notes=[use_labels(note, labels) for note in shown.notes])
+
+
+def use_labels(sentence: str, labels: Mapping[str, str]) -> str:
+    """Replace the captures' names in a sentence by the operator's labels."""
+    names = [re.escape(name) for name, label in labels.items() if label != name]
+    return (
+        re.sub(rf"(?<![\w.-])({'|'.join(names)})(?![\w-])", lambda m: labels[m[1]], sentence)
+        if names
+        else sentence
+    )
 
 
 def _make_column(title: str) -> Column:

@@ -7,7 +7,7 @@ import html
 import io
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
@@ -75,11 +75,13 @@ Item = Figure | Table | PageNotice
 
 @dataclass(frozen=True)
 class Section:
-    """A titled part of a page: paragraphs, then its figures, tables and notices in order."""
+    """A titled part of a page: paragraphs, then its figures, tables and notices in order. Sections
+    of the annex follow the others, and are lettered."""
 
     title: str
     text: str | Sequence[str]
     items: Sequence[Item] = ()
+    is_annex: bool = False
 
     @property
     def paragraphs(self) -> tuple[str, ...]:
@@ -103,6 +105,19 @@ class Headline(NamedTuple):
     mark: Mark = ""
 
 
+@dataclass(frozen=True, eq=False)
+class TitlePage:
+    """What a report begins with: ``details`` by name, a ``logo`` (WebP as base64), the ``verdict``
+    in a word, what it rests on, and pictures side by side."""
+
+    details: Mapping[str, str]
+    verdict: str
+    kind: Literal["good", "bad", "warning", "plain"]
+    reasons: Sequence[str]
+    figures: Sequence[Figure] = ()
+    logo: str = ""
+
+
 def write_page(
     path: Path | str,
     title: str,
@@ -111,13 +126,14 @@ def write_page(
     sections: Sequence[Section],
     certify: Callable[[str], str] | None = None,
     frame: str = "in the camera's frame",
+    title_page: TitlePage | None = None,
 ) -> None:
     """Write the page to ``path``, complete or not at all; every text is shown as typed, never run.
 
     ``frame``: in what coordinates places are; ``certify``: returns the text of the certificate that
     the page keeps, given its digest. Raises SessionError where the file cannot be written.
     """
-    page = _render(title, subtitle, headlines, sections, frame)
+    page = _render(title, subtitle, headlines, sections, frame, title_page)
     if certify is not None:
         kept = html.escape(certify(page_digest(page))).join(CERTIFICATE)
         page = page.replace("</body>", f"{kept}</body>")
@@ -148,12 +164,14 @@ def _render(
     headlines: Sequence[Headline],
     sections: Sequence[Section],
     frame: str,
+    title_page: TitlePage | None,
 ) -> str:
     """The page as HTML, from the template."""
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
     figures = [item for section in sections for item in section.items if isinstance(item, Figure)]
+    figures += title_page.figures if title_page else ()
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the encoder releases the GIL
         pictures = dict(zip(figures, pool.map(_encode_webp, figures), strict=True))
     here = Path(__file__).parent
@@ -169,13 +187,23 @@ def _render(
     environment.tests["table"] = lambda item: isinstance(item, Table)
     environment.filters["webp"] = pictures.__getitem__
     template = environment.from_string((here / "page.html.j2").read_text(encoding="utf-8"))
+    running = " · ".join(filter(None, (title, title_page and title_page.details.get("Order"))))
     return template.render(
         title=title,
+        title_page=title_page,
         subtitle=subtitle,
         headlines=headlines,
         sections=sections,
         style=Markup((here / "page.css").read_text(encoding="utf-8")),  # noqa: S704, ours, not a user's
+        running=Markup(_format_css_string(running)),  # noqa: S704, escaped
         version=__version__,
         frame=frame,
         written=datetime.now().strftime("%Y-%m-%d %H:%M"),
     )
+
+
+def _format_css_string(text: str) -> str:
+    """A text as a string of a style sheet, which nothing in it can end."""
+    plain = escape_controls(text)
+    escaped = (c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in plain)
+    return f'"{"".join(escaped)}"'

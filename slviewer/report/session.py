@@ -3,20 +3,27 @@ parts, with a trend chart of each characteristic."""
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import median
 from typing import Any, Literal
 
 import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
-from slviewer.evaluation.render import format_count, format_counts
+from slviewer.evaluation.render import format_count
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
-from slviewer.records.acceptance import MARKS, Decision
+from slviewer.records.acceptance import MARKS, AcceptanceTest, Decision, worst_decision
+from slviewer.records.calibration import ModelCalibration
+from slviewer.records.drift import Drift
 from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
+from slviewer.records.measurement import Measurement
+from slviewer.records.merge import Merge
+from slviewer.records.model_comparison import ModelComparison
+from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.record import Record
-from slviewer.records.table import Cell, Column, Mark, Table, Value
+from slviewer.records.table import Cell, Column, Mark, Table, Value, relabel
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, average
 from slviewer.report.canvas import (
@@ -25,14 +32,32 @@ from slviewer.report.canvas import (
     SOFT,
     finish_figure,
     new_figure,
-    percentile,
     style_axes,
 )
 from slviewer.report.maps import rms_maps
-from slviewer.report.page import Figure, Headline, Item, PageNotice, Section, write_page
+from slviewer.report.page import Figure, Headline, Item, PageNotice, Section, TitlePage, write_page
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
 from slviewer.session.capture import Capture
+from slviewer.session.report_details import ReportDetails
 
+RESULTS: tuple[type[Record], ...] = (Inspection, Measurement)
+"""Kinds of records that are results; the others are annex, and begin with these."""
+ANNEX: tuple[type[Record], ...] = (
+    Verification, AcceptanceTest, Merge, Reconstruction, Drift, ModelComparison, ModelCalibration
+)  # fmt: skip
+TERMS = {
+    "RMS": "root mean square: the typical size of deviations",
+    "noise floor": "the RMS that the noise of a capture alone would give",
+    "sigma": "standard deviation, k = 1",
+    "U (k = 2)": "expanded uncertainty: with about 95 % probability the true value is within ± U",
+    "calibrated depths": "distances from the camera at which the target was captured; nearer and"
+    " farther the calibration is extrapolated",
+    "stereo": "model of lenses and poses of camera and projector",
+    "pixelwise": "model with a function of its own for each camera pixel",
+    "splined": "stereo with smooth local corrections of both lenses",
+    "reprojection": "where the calibration predicts the target's features, compared with where they"
+    " were seen",
+}
 DEVICES = ("camera", "projector")
 WORST = 2.0
 """A pose whose reprojection error exceeds the RMS over the poses this many times is marked."""
@@ -43,7 +68,7 @@ class CaptureUse:
     """Whether the calibration uses a capture, and ``why`` it does not."""
 
     capture: Capture
-    state: Literal["used", "unused", "excluded", "scan", "waiting"]
+    state: Literal["used", "unused", "excluded", "scan", "known shape", "waiting"]
     why: str = ""
 
 
@@ -76,7 +101,8 @@ class SessionData:
     ``model``: the one that is used, and the one ``recommended``; ``scales``: {model: what
     correction of scale was applied, in words}. ``region``: the region of interest that is in
     effect, in words; ``edits``
-    of scans in their order: scan and words.
+    of scans in their order: scan and words; ``labels``: {capture: what the operator calls it}.
+    ``details`` of the title page, and its ``pictures``.
     """
 
     name: str
@@ -92,47 +118,98 @@ class SessionData:
     scales: Mapping[str, str] = field(default_factory=dict)
     region: str = ""
     edits: Sequence[tuple[str, str]] = ()
+    labels: Mapping[str, str] = field(default_factory=dict)
+    details: ReportDetails = field(default_factory=ReportDetails)
+    pictures: Sequence[Figure] = ()
 
 
 def session_title(data: SessionData) -> tuple[str, str]:
-    """The page's title and the sentence below it."""
-    counts = format_counts(each.capture.purpose for each in data.captures)
-    return data.name, f"{counts}; {format_count(_count_used(data), 'pose')} used to calibrate."
+    """The page's title, the part's name if it is stated, and the sentence below it."""
+    states = [each.state for each in data.captures]
+    counts = [
+        ("measured in", states.count("scan"), "scan"),
+        ("checked on", states.count("known shape"), "known shape"),
+        ("calibrated with", states.count("used"), "target pose"),
+    ]
+    listed = ", ".join(f"{verb} {format_count(n, noun)}" for verb, n, noun in counts if n)
+    return data.details.part or data.name, f"{listed[:1].upper()}{listed[1:]}." if listed else ""
 
 
-def _count_used(data: SessionData) -> int:
-    """The number of target poses that the calibration was made from."""
-    return sum(each.state == "used" for each in data.captures)
+def make_title_page(data: SessionData) -> TitlePage:
+    """The title page: details of the job, pictures, and whether the part is within its limits."""
+    scans = [each.capture for each in data.captures if each.state == "scan"]
+    days = sorted({str(each.meta.get("created", ""))[:10] for each in scans} - {""})
+    measured = {"Measured on": " to ".join(dict.fromkeys((days[0], days[-1])))} if days else {}
+    rows = data.details.rows() | measured
+    decision, reasons = judge_part(data)
+    kinds: dict[str, Any] = {"pass": "good", "fail": "bad", "undecided": "warning"}
+    return TitlePage(
+        {name: text for name, text in rows.items() if name != "Part"},  # the title
+        decision or "not judged",
+        kinds.get(decision or "", "plain"),
+        reasons,
+        data.pictures,
+        data.details.logo,
+    )
+
+
+def judge_part(data: SessionData) -> tuple[Decision | None, list[str]]:
+    """The decision by all inspections and tolerances, None where there are none, and what it rests
+    on; nothing is decided with a rejected calibration."""
+    decided: dict[str, Decision] = {}
+    for view in data.records:
+        for name, each in view.records.items():
+            if isinstance(each, Inspection):
+                decided[f"{each.summary()}."] = worst_decision(
+                    {decision for decision, parts in each.count_parts().items() if parts}
+                )
+            elif isinstance(each, Measurement) and each.deviation and each.deviation.verdict:
+                verdict = each.deviation.verdict
+                decided[f"{name}: {verdict.text()}."] = verdict.decision
+    if not decided:
+        return None, ["No limits or tolerances were stated, so the part is measured, not judged."]
+    level = "good" if data.verdict is None else data.verdict.level
+    if level == "rejected":
+        return "undecided", ["The calibration is rejected: its measurements decide nothing."]
+    doubt = ["The calibration is doubtful: see the annex."] if level == "doubtful" else []
+    return worst_decision(set(decided.values())), [*decided, *doubt]
 
 
 def session_headlines(data: SessionData) -> list[Headline]:
-    """Headlines: verdict, poses used, reprojection error, RMS of the fit, and the best flatness
-    verified."""
+    """Headlines: the surface, its noise, the best flatness verified, tests with certified
+    artefacts, and the verdict on the calibration."""
+    records = {view.kind: list(view.records.items()) for view in data.records}
     headlines = []
+    if merges := records.get(Merge):
+        merge = merges[-1][1]
+        note = f"from {format_count(len(merge.scans), 'scan')}"
+        headlines.append(Headline(f"{merge.points:,}", "points of the merged surface", note))
+    scans = {each.capture.name for each in data.captures if each.state == "scan"}
+    noises = [
+        each.noise_mm
+        for _, each in records.get(Reconstruction, ())
+        if each.noise_mm is not None and scans & each.inputs.keys()
+    ]
+    if noises:
+        note = "standard deviation of depth, median over the scans"
+        headlines.append(Headline(f"{median(noises):.3f} mm", "noise of a point", note))
+    headlines += _plane_headline(data)
+    if tests := records.get(AcceptanceTest):
+        test = tests[-1][1]
+        decision = test.decision or "not decided"
+        label = f"test with {test.artefact.name}"
+        headlines.append(Headline(decision, label, test.time[:10], MARKS.get(decision, "")))
     if data.verdict is not None:
         mark: Mark = "better" if data.verdict.level == "good" else "worse"
-        count = format_count(len(data.verdict.findings), "finding")
-        headlines.append(Headline(data.verdict.level, "verdict on the calibration", count, mark))
-    if data.calibration is not None:
-        stereo = data.calibration.stereo
-        wanted = sum(each.capture.role == "calibration" for each in data.captures)
-        used, note = f"{_count_used(data)} of {wanted}", f"boards at {_format_depths(stereo)}"
-        headlines.append(Headline(used, "target poses used", note))
-        if rms := stereo.reprojection_rms_px:
-            both = f"both devices together {rms['stereo']:.3f} px" if "stereo" in rms else ""
-            devices = "{} / {} px".format(*(f"{rms.get(d, np.nan):.3f}" for d in DEVICES))
-            headlines.append(Headline(devices, "reprojection RMS, camera / projector", both))
-    fits = [(percentile(rms[0], 50), axis) for axis, rms in data.pixel_fits.items()]
-    if known := [fit for fit in fits if np.isfinite(fit[0])]:
-        rms_z, axis = min(known)
-        note = f"median over the pixels, axis {axis}"
-        headlines.append(Headline(f"{rms_z:.3f} mm", "pixel-wise fit, RMS in z", note))
-    return headlines + _plane_headline(data)
+        findings = data.verdict.findings
+        note = f"{format_count(len(findings), 'finding')}: see the annex" if findings else ""
+        headlines.append(Headline(data.verdict.level, "verdict on the calibration", note, mark))
+    return headlines
 
 
 def _plane_headline(data: SessionData) -> list[Headline]:
-    """Headline of the flattest model's mean plane RMS, beside its noise floor and the other
-    models'."""
+    """Headline of the mean plane RMS of the model in use, else of the flattest, beside its noise
+    floor."""
     planes = [
         each
         for view in data.records
@@ -143,46 +220,61 @@ def _plane_headline(data: SessionData) -> list[Headline]:
     means = {model: mm for model, mm in found.rms_mm.items() if np.isfinite(mm)}
     if not means:
         return []
-    best, floor = found.best, found.models[found.best].noise_floor_mm
-    notes = [] if floor is None else [f"noise floor {floor:.3f} mm"]
-    notes += [f"{other} {mm:.3f} mm" for other, mm in means.items() if other != best]
-    mark: Mark = "better" if len(means) > 1 else ""
-    return [Headline(f"{means[best]:.3f} mm", f"mean plane RMS, {best}", "; ".join(notes), mark)]
+    model = data.model if data.model in means else found.best
+    floor = found.models[model].noise_floor_mm
+    note = f"model {model}" + ("" if floor is None else f"; noise alone gives {floor:.3f} mm")
+    return [Headline(f"{means[model]:.3f} mm", "RMS deviation of a flat plate", note)]
 
 
 def session_sections(data: SessionData) -> list[Section]:
-    """Sections: warnings, then calibration, verification and clouds as far as present, then the
-    captures."""
-    sections = _notice_section(data)
+    """Sections: warnings, what was inspected and measured; as annex the other records, calibration,
+    restrictions, method, and captures."""
+    views = {view.kind: view for view in data.records}
+    results = [_records_section(views.pop(kind), data.labels) for kind in RESULTS if kind in views]
+    first = [views.pop(kind) for kind in ANNEX if kind in views]
+    annex = [_records_section(view, data.labels) for view in (*first, *views.values())]
     if data.verdict is not None:
-        sections.append(_verdict_section(data.verdict, data.verdict_of_calibration))
+        annex.append(_verdict_section(data.verdict, data.verdict_of_calibration))
     if data.calibration is not None:
-        sections += [
+        annex += [
             _reprojection_section(data.calibration),
             Section(
                 "Parameters",
-                "Pinhole and Brown distortion of both devices, and where the projector stands in"
-                " the camera's frame.",
+                "Lenses (pinhole and Brown distortion) of camera and projector, and where the"
+                " projector is in the camera's frame.",
                 [lens_table(data.calibration.stereo), rig_table(data.calibration.stereo)],
             ),
         ]
-    if data.model:
-        used = f"Measured with {data.model}"
-        if data.model != data.recommended:
-            used += f", as the operator has chosen; recommended: {data.recommended}"
-        scales = [PageNotice(f"{model}: {words}.", "plain") for model, words in data.scales.items()]
-        sections.append(Section("Model in use", f"{used}.", scales))
     if data.pixel_fits:
         text = (
             "Each camera pixel's own rational function from phase to depth, and lines from depth to"
             " x and y."
         )
         maps = [rms_maps(rms, axis) for axis, rms in data.pixel_fits.items()]
-        sections.append(Section("Pixel-wise model", text, maps))
-    sections += [_records_section(view) for view in data.records]
+        annex.append(Section("Pixel-wise model", text, maps))
     if data.region or data.edits:
-        sections.append(_restrictions_section(data))
-    return [*sections, _captures_section(data)]
+        annex.append(_restrictions_section(data))
+    annex += [_method_section(data), _captures_section(data)]
+    return [*_notice_section(data), *results, *(replace(each, is_annex=True) for each in annex)]
+
+
+def _method_section(data: SessionData) -> Section:
+    """The section about how was measured, in what environment, and what terms mean."""
+    text = [
+        "A projector casts stripe patterns on the object, and a camera records them. Which stripe"
+        " each camera pixel sees gives, with the calibration of both, the position of a point."
+        " Scans from several sides are registered onto each other and merged into one surface."
+    ]
+    if data.model:
+        used = f"Measured with the calibration model {data.model}"
+        if data.model != data.recommended:
+            used += f", as the operator has chosen; recommended: {data.recommended}"
+        text.append(f"{used}.")
+    known = data.details.rows().get("Temperature")
+    text.append(f"Temperature: {known or 'not recorded'}.")
+    scales = [PageNotice(f"{model}: {words}.", "plain") for model, words in data.scales.items()]
+    table = Table.of([{"term": term, "meaning": words} for term, words in TERMS.items()], "Terms")
+    return Section("Method and terms", text, [*scales, table])
 
 
 def _notice_section(data: SessionData) -> list[Section]:
@@ -216,11 +308,13 @@ def _captures_section(data: SessionData) -> Section:
     rows = []
     for each in data.captures:
         capture, sequence = each.capture, each.capture.sequence
+        made = str(capture.meta.get("created", ""))[:16].replace("T", " ")
         size = sequence.projector_size
         periods = [f"{axis} {sequence.period_px(axis):g}" for axis in sequence.axes]
         rows.append(
             {
                 "capture": capture.name,
+                "called": data.labels.get(capture.name, ""),
                 "role": capture.role,
                 "state": Cell(each.state, marks.get(each.state, "")),
                 Column("camera", "px", align="right"): (
@@ -235,13 +329,18 @@ def _captures_section(data: SessionData) -> Section:
                 ),
                 "frames": len(sequence.frames) or "",
                 Column("period", "px", align="centre"): ", ".join(periods),
-                "made": capture.meta.get("created", ""),
+                Column("made", align="centre"): made,
                 "why not used": each.why,
+                "hash": capture.hash,
             }
         )
     if not rows:
         return Section("Captures", "The session holds no captures yet.")
-    table = Table.of(rows, "Captures of the session").without_empty()
+    note = (
+        "Hash: BLAKE2b, 160 bits, of frames and description; the hash of every single frame is kept"
+        " in this file."
+    )
+    table = Table.of(rows, "Captures of the session", [note]).without_empty()
     return Section("Captures", "", [table])
 
 
@@ -348,15 +447,14 @@ def _format_depths(stereo: StereoModel) -> str:
     return "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm)
 
 
-def _records_section(view: RecordsView) -> Section:
+def _records_section(view: RecordsView, labels: Mapping[str, str]) -> Section:
     """The section with the tables and pictures of the records of one kind."""
     text = inspect.cleandoc(view.kind.__doc__ or "").split("\n\n")[0].replace("\n", " ")
     notices = [
         PageNotice(f"{each.summary()}.") for each in view.records.values() if not each.is_good
     ]
-    return Section(
-        view.kind.title, text, [*notices, *view.kind.tables(view.records), *view.figures]
-    )
+    tables = [relabel(each, labels) for each in view.kind.tables(view.records)]
+    return Section(view.kind.title, text, [*notices, *tables, *view.figures])
 
 
 _LEVELS: dict[str, tuple[str, str]] = {
@@ -381,7 +479,7 @@ def _verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
         if of_calibration
         else "This verdict is on the last attempt to calibrate, which gave no calibration."
     )
-    return Section("Verdict", text, items)
+    return Section("Verdict on the calibration", text, items)
 
 
 COLOURS: dict[Decision, str] = {"pass": "#1f9673", "fail": "#c2362e", "undecided": "#c98a12"}

@@ -112,6 +112,8 @@ def _shade_lambert(normals: NDArray[np.floating]) -> NDArray[np.floating]:
 YAW_DEG, PITCH_DEG = 24.0, 18.0
 SCANS = ("#5b8fd0", "#e0a13c", "#63b28a", "#c8718f", "#8f83c9")
 CLAY = (0.80, 0.79, 0.77)
+PICTURE = (DENSITY * HALF, DENSITY * 396)
+"""Width and height of the pictures of a title page, px."""
 MOST_POINTS = 300_000
 """Points drawn of one cloud: more change nothing at the size of a page."""
 
@@ -160,6 +162,41 @@ def draw_clouds(clouds: Mapping[str, np.ndarray]) -> Figure:
         "Shaded views of "
         + ", ".join(f"{name} ({_format_count(cloud)})" for name, cloud in clouds.items()),
     )
+
+
+def draw_photo(name: str, texture: np.ndarray, points: np.ndarray) -> Figure:
+    """The part as the camera sees it: ``texture`` (h, w) or (h, w, 3) uint8 around the measured
+    pixels of ``points`` (h, w, 3)."""
+    (h, w), (width, height) = texture.shape[:2], PICTURE
+    v, u = np.nonzero(np.isfinite(points[..., 2]))
+    box = (u.min(), u.max() + 1, v.min(), v.max() + 1) if len(u) else (0, w, 0, h)
+    # a cut-out of the picture's shape, with a margin, as far as the image has it
+    tall = min(
+        1.15 * max(box[3] - box[2], (box[1] - box[0]) * height / width), h, w * height / width
+    )
+    size = max(round(tall * width / height), 1), max(round(tall), 1)
+    left, top = (
+        int(np.clip((low + high - length) // 2, 0, full - length))
+        for low, high, length, full in zip(box[::2], box[1::2], size, (w, h), strict=True)
+    )
+    shown = texture[top : top + size[1], left : left + size[0]]
+    way = cv2.INTER_AREA if size[0] > width else cv2.INTER_CUBIC
+    image = cv2.resize(np.ascontiguousarray(shown), PICTURE, interpolation=way)
+    rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+    words = f"The part as the camera sees it ({name})"
+    return Figure(rgb, f"{words}.", words, HALF)
+
+
+def draw_surface(words: str, points: np.ndarray, normals: np.ndarray | None) -> Figure:
+    """A surface of ``points`` (n, 3) mm in clay, seen from above and aside; ``normals`` (n, 3) NaN
+    or None where unknown; ``words``: what it is of."""
+    step = max(1, -(-len(points) // MOST_POINTS))
+    shown = points[::step]
+    facing = np.full_like(shown, np.nan) if normals is None else normals[::step]
+    clay = np.broadcast_to(CLAY, shown.shape)
+    image = render_points(shown, facing, clay, PICTURE, view_rotation(YAW_DEG, PITCH_DEG))
+    words = f"{words}, {_format_count(points)}"
+    return Figure(image, f"{words}, shaded.", f"Shaded view of the surface: {words}", HALF)
 
 
 def draw_merged_cloud(fused: Fused) -> Figure:

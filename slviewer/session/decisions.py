@@ -16,10 +16,11 @@ from typing import Annotated, Any, Literal, TypedDict
 import msgspec
 
 from slviewer.errors import DamagedError, InputError
-from slviewer.records.plain import from_plain
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.names import natural_key, new_name
 from slviewer.session.reading import read_json
+from slviewer.session.report_details import ReportDetails
 from slviewer.session.results import Exposure
 
 _Millimetres = Annotated[float, msgspec.Meta(gt=-1e6, lt=1e6)]
@@ -52,6 +53,7 @@ _Decisions = TypedDict(
         "use_anyway": str | None,
         "align_scans": bool | None,
         "region": _Region | None,
+        "report": ReportDetails | None,
     },
     total=False,
 )
@@ -99,6 +101,17 @@ class Decisions:
         with contextlib.suppress(DamagedError):
             return self.decision(what)
         return None
+
+    def report_details(self) -> ReportDetails:
+        """What the title page of reports states; nothing where it is damaged, as `decision_faults`
+        states."""
+        stored = self.valid_decision("report")
+        return from_plain(stored, ReportDetails) if stored else ReportDetails()
+
+    def save_report_details(self, details: ReportDetails) -> None:
+        """Remember what the title page of reports states. Raises InputError for impossible
+        ones."""
+        self.decide("report", to_plain(details.clean()))
 
     def decision_faults(self) -> list[str]:
         """What is damaged in the decisions, each with its remedy."""

@@ -10,7 +10,7 @@ from facts import raises
 
 from slviewer.errors import InputError, SessionError
 from slviewer.records.table import Cell, Column, Table
-from slviewer.report.page import Figure, Headline, PageNotice, Section, write_page
+from slviewer.report.page import Figure, Headline, PageNotice, Section, TitlePage, write_page
 
 PIXELS = np.zeros((4, 300, 3), np.uint8)
 EVIL = "<script>alert('x')</script> \"quoted\" & <img src=y onerror=z>"
@@ -58,6 +58,31 @@ def test_texts_are_shown_and_never_run(tmp_path: Path) -> None:
     assert "<script" not in page and "<img src=y" not in page
     assert page.count("&lt;script&gt;alert(&#39;x&#39;)&lt;/script&gt;") >= 12
     assert not re.search(r'="[^"]*"quoted"', page)  # no attribute is broken out of
+
+
+def test_the_title_page_comes_first_and_the_annex_last(tmp_path: Path) -> None:
+    figure = Figure(PIXELS, "the part", "the part", 300)
+    hostile = f"{EVIL}</style>\n}} \u202e"
+    details = {"Customer": hostile, "Order": hostile}
+    title_page = TitlePage(details, "pass", "good", [hostile], [figure], "QUJD")
+    sections = [Section("Results", "", [table()]), Section("Scans", "", is_annex=True)]
+    path = tmp_path / "report.html"
+    write_page(path, hostile, "s", [], sections, title_page=title_page)
+    page = path.read_text(encoding="utf-8")
+    places = [page.index(text) for text in ("PASS", 'alt="the part"', ">Results<", ">Scans<")]
+    assert places == sorted(places) and "data:image/webp;base64,QUJD" in page
+    assert page.count("</style>") == 1 and "<script" not in page and "\u202e" not in page
+    assert page.count("&lt;script&gt;") == 5  # in title, heading, details and reason
+    (running,) = re.findall(r"@top-left \{ content: (.*); \} \} \}", page)
+    assert re.fullmatch(r'"([0-9A-Za-z]|\\[0-9a-f]+ )+"', running)
+    for rule in (
+        "break-before: page",
+        "break-inside: avoid",
+        "table-header-group",
+        "counter(page)",
+    ):
+        assert rule in page
+    assert re.findall(r'<section id="[^"]+"( class="annex")?>', page) == ["", ' class="annex"']
 
 
 def test_anchors_lead_to_their_sections(tmp_path: Path) -> None:

@@ -13,9 +13,15 @@ from made_up import MODELS, planes, reproduction_data, session_data, spheres
 from slviewer.calibration.stereo import StereoModel
 from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.stored_records import read_record
-from slviewer.records.acceptance import AcceptanceTest
+from slviewer.records.acceptance import AcceptanceTest, Decision
 from slviewer.records.calibration import ModelCalibration, SplinedFit, VolumeSigma
 from slviewer.records.drift import Drift
+from slviewer.records.inspection import (
+    Characteristic,
+    CharacteristicResult,
+    Inspection,
+    PartResult,
+)
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.table import Cell, Table, better_worse, compare_errors
 from slviewer.records.verdict import Finding, Verdict
@@ -33,6 +39,7 @@ from slviewer.report.reproduction import (
 from slviewer.report.session import (
     CalibrationFigures,
     RecordsView,
+    make_title_page,
     session_headlines,
     session_sections,
     session_title,
@@ -41,6 +48,7 @@ from slviewer.report.session import (
 pytestmark = pytest.mark.computes
 
 WIDTH = 240
+WIDTH_WANTED = Characteristic("width", "distance", ("a", "b"), upper=2.0)
 
 
 def texts(section: Section) -> str:
@@ -207,8 +215,10 @@ def test_a_sessions_report(tmp_path: Path) -> None:
     sections = session_sections(data)
     titles = [section.title for section in sections]
     assert titles == [
-        "Warnings", "Reprojection", "Parameters", "Pixel-wise model", "Verification", "Captures"
+        "Warnings", "Verification", "Reprojection", "Parameters", "Pixel-wise model",
+        "Method and terms", "Captures",
     ]  # fmt: skip
+    assert [section.is_annex for section in sections] == [False] + [True] * 6
     words = "\n".join(texts(section) for section in sections)
     facts = (
         "12 of 336 circles",
@@ -222,7 +232,7 @@ def test_a_sessions_report(tmp_path: Path) -> None:
     assert missing_facts(words, *facts) == []
     path = tmp_path / "report.html"
     title, counts = session_title(data)
-    assert missing_facts(counts, f"{len(data.captures) - 1} poses", "1 scan") == []
+    assert missing_facts(counts, "23 target poses", "1 scan") == []
     write_page(path, title, counts, session_headlines(data), sections)
     page = path.read_text(encoding="utf-8")
     assert "&lt;script&gt;" in page and "<script" not in page and "<b>" not in page
@@ -233,8 +243,50 @@ def test_a_session_with_nothing_in_it() -> None:
     data = dataclasses.replace(
         session_data(WIDTH), captures=[], calibration=None, pixel_fits={}, records=(), warnings=()
     )
-    (section,) = session_sections(data)
+    method, section = session_sections(data)
+    assert "not recorded" in texts(method) and make_title_page(data).verdict == "not judged"
     assert missing_facts(texts(section), "captures") == [] and session_headlines(data) == []
+
+
+def test_results_come_first_and_all_limits_decide() -> None:
+    def inspected(*decisions: Decision) -> Inspection:
+        parts = tuple(
+            PartResult(f"part_{k}", (CharacteristicResult("width", 1.0, 0.1, each),))
+            for k, each in enumerate(decisions)
+        )
+        return Inspection(plan="plate", characteristic=(WIDTH_WANTED,), parts=parts)
+
+    def judged(verdict: Verdict | None, *decisions: Decision) -> tuple[str, str]:
+        views = [*data.records, RecordsView(Inspection, {"1": inspected(*decisions)})]
+        page = make_title_page(dataclasses.replace(data, records=views, verdict=verdict))
+        return page.verdict, page.kind
+
+    data = session_data(WIDTH)
+    assert judged(None, "pass", "pass") == ("pass", "good")
+    assert judged(None, "pass", "fail", "undecided") == ("fail", "bad")
+    assert judged(None, "pass", "undecided") == ("undecided", "warning")
+    faults = {
+        level: Verdict.of([Finding("outlier", level, "a pose moved", "repeat it")])
+        for level in ("doubtful", "rejected")
+    }
+    assert judged(faults["doubtful"], "fail")[0] == "fail"
+    assert judged(faults["rejected"], "pass")[0] == "undecided"
+    views = [*data.records, RecordsView(Inspection, {"1": inspected("pass")})]
+    sections = session_sections(dataclasses.replace(data, records=views))
+    assert [section.title for section in sections if not section.is_annex] == [
+        "Warnings", "Inspection"
+    ]  # fmt: skip
+
+
+def test_the_title_page_counts_scans_of_the_part_alone() -> None:
+    data = session_data(WIDTH)
+    plate = dataclasses.replace(data.captures[-1], state="known shape")
+    counted = dataclasses.replace(data, captures=[*data.captures, plate])
+    assert missing_facts(session_title(counted)[1], "1 scan", "1 known shape", 23) == []
+    bare = dataclasses.replace(data, model="stereo")
+    assert {h.label: h.value for h in session_headlines(bare)} == {
+        "RMS deviation of a flat plate": "0.166 mm"
+    }
 
 
 def test_a_calibration_made_elsewhere() -> None:
@@ -244,7 +296,8 @@ def test_a_calibration_made_elsewhere() -> None:
     sections = session_sections(
         dataclasses.replace(data, calibration=bare, records=(), pixel_fits={})
     )
-    assert missing_facts(texts(sections[1]), "elsewhere") == []
+    reprojection = next(each for each in sections if each.title == "Reprojection")
+    assert missing_facts(texts(reprojection), "elsewhere") == []
 
 
 @pytest.mark.slow
@@ -362,7 +415,7 @@ def test_how_good_a_calibration_is() -> None:
             RecordsView(Verification, balls),
         ],
     )
-    assert session_headlines(data)[0].value == "doubtful"
+    assert [each.value for each in session_headlines(data)] == ["undecided", "doubtful"]
     words = "\n".join(texts(section) for section in session_sections(data))
     facts = (
         "fill it in two more poses",
