@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from slviewer.calibration.observe import Observation
@@ -134,7 +133,7 @@ def report(settings: ReportSettings) -> str:
     changed = settings.changed_details()
     with opened(settings.session, write=bool(changed)) as store:
         if changed:
-            store.save_report_details(msgspec.structs.replace(store.report_details(), **changed))
+            store.set_report_details(**changed)
         progress(0.1, "reading the session")
         data = _collect_data(store)
         for message in data.warnings:
@@ -173,9 +172,7 @@ def _collect_data(store: Session) -> SessionData:
         pixel_fits = {axis: fit.rms_mm for axis, fit in pixelwise.fits.items()}
     judged = None if stereo is None else load_record(store, ModelCalibration, "stereo").verdict
     records, outdated = _collect_records(store)
-    known = _list_inputs(records, Verification, AcceptanceTest, Drift)
-    known |= {each.name for each in store.captures() if each.purpose in ("plane", "sphere")}
-    known -= _list_inputs(records, Merge, Inspection)
+    known = _list_known_shapes(store, records)
     region = load_region(store)
     return SessionData(
         name=store.folder.name,
@@ -201,10 +198,17 @@ def _collect_data(store: Session) -> SessionData:
     )
 
 
-def _list_inputs(records: Sequence[RecordsView], *kinds: type[Record]) -> set[str]:
-    """Return the names of all inputs of the records of some kinds."""
-    views = [view for view in records if view.kind in kinds]
-    return {name for view in views for each in view.records.values() for name in each.inputs}
+def _list_known_shapes(store: Session, records: Sequence[RecordsView]) -> set[str]:
+    """Return the captures of known shapes: made for that, or verified and no part."""
+
+    def list_inputs(*kinds: type[Record]) -> set[str]:
+        """Return the names of all inputs of the records of some kinds."""
+        views = [view for view in records if view.kind in kinds]
+        return {name for view in views for each in view.records.values() for name in each.inputs}
+
+    made = {each.name for each in store.captures() if each.purpose in ("plane", "sphere")}
+    verified = list_inputs(Verification, AcceptanceTest, Drift)
+    return (made | verified) - list_inputs(Merge, Inspection)
 
 
 def _draw_part(store: Session, known: Collection[str]) -> Iterator[Figure]:

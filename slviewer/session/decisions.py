@@ -108,9 +108,10 @@ class Decisions:
         stored = self.valid_decision("report")
         return from_plain(stored, ReportDetails) if stored else ReportDetails()
 
-    def save_report_details(self, details: ReportDetails) -> None:
-        """Remember what the title page of reports states. Raises InputError for impossible
-        ones."""
+    def set_report_details(self, **changed: Any) -> None:
+        """Set some of what the title page of reports states. Raises InputError for what is
+        impossible."""
+        details = msgspec.structs.replace(self.report_details(), **changed)
         self.decide("report", to_plain(details.clean()))
 
     def decision_faults(self) -> list[str]:

@@ -11,6 +11,14 @@ from slviewer.errors import InputError
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.names import clean_label
 
+FIELDS = {
+    "part": "Part",
+    "customer": "Customer",
+    "order": "Order",
+    "operator": "Operator",
+    "temperature_c": "Temperature",
+}
+"""Of the details but the logo, and what they are called."""
 LOGO_PX = (480, 160)
 """Width and height that a logo is reduced to: twice the size at which pages show it."""
 _LOGO_FORMATS = ("PNG", "JPEG", "WEBP")
@@ -39,17 +47,9 @@ class ReportDetails(msgspec.Struct, frozen=True, kw_only=True):
     def rows(self) -> dict[str, str]:
         """Return the details that are stated, with their units, by name."""
         t = self.temperature_c
-        return {
-            name: text
-            for name, text in (
-                ("Part", self.part),
-                ("Customer", self.customer),
-                ("Order", self.order),
-                ("Operator", self.operator),
-                ("Temperature", "" if t is None else f"{t:.4g} °C".replace("-", "−")),
-            )
-            if text
-        }
+        temperature = "" if t is None else f"{t:.4g} °C".replace("-", "−")
+        texts = [temperature if f == "temperature_c" else getattr(self, f) for f in FIELDS]
+        return {name: text for name, text in zip(FIELDS.values(), texts, strict=True) if text}
 
 
 def encode_logo(name: str, content: bytes) -> str:

@@ -4,6 +4,7 @@ It holds no frames, and no passwords, which addresses of cameras may contain.
 """
 
 import importlib.metadata
+import json
 import logging
 import os
 import platform
@@ -114,8 +115,12 @@ def _collect(job: Job, snapshot: Snapshot, log: LogKeeper) -> Iterator[tuple[str
     for file in ("session.json", "decisions.json"):
         # whatever it holds: a damaged one may be the reason for the report
         with suppress(OSError):
-            content = read_file(session.folder / file, MAX_JSON_BYTES)
-            yield f"session/{file}", content.decode(errors="replace")
+            text = read_file(session.folder / file, MAX_JSON_BYTES).decode(errors="replace")
+            with suppress(ValueError, AttributeError, RecursionError):
+                known = json.loads(text)
+                if known.pop("report", None):  # the customer's name concerns nobody else
+                    text = json.dumps(known, indent=2)
+            yield f"session/{file}", text
     job.progress(0.4, "captures and results")
     for capture in session.captures():
         described = {key: value for key, value in capture.meta.items() if key != "sequence"}

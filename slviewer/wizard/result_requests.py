@@ -63,6 +63,7 @@ from slviewer.registration.refusal import Refused
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
 from slviewer.session.names import clean_label, plain_name, safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
+from slviewer.session.report_details import encode_logo
 from slviewer.session.scan_edits import load_edits, load_region, save_region
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
@@ -410,6 +411,13 @@ class ResultRequests(Engine):
             return _export_file(job, what, name, chosen, plan)
 
         self._work("Exporting", write if texture is None else write_textured, "measurements")
+
+    set_report_details = on_session("Changing the title page", Session.set_report_details)
+
+    @request("Reading the logo")
+    def upload_logo(self, name: str, content: bytes) -> None:
+        """Set an uploaded image as the report's logo."""
+        self._store.set_report_details(logo=encode_logo(name, content))
 
     @request("Collecting diagnostics")
     def diagnostic_bundle(self) -> None:

@@ -160,6 +160,7 @@ class SessionReader:
             aligns_scans=bool(session.valid_decision("align_scans")),
             region=self._attempt("the region", load_region, session, even_if_off=True),
             region_is_on=bool((session.valid_decision("region") or {}).get("on")),
+            report_details=session.report_details(),
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
             faults=tuple(dict.fromkeys(self._faults)),

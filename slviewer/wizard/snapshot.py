@@ -24,6 +24,7 @@ from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict
 from slviewer.registration.refusal import Reason
 from slviewer.session.capture import Purpose, TurnStep
+from slviewer.session.report_details import ReportDetails
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 
@@ -266,6 +267,7 @@ class SessionView:
     aligns_scans: bool = False  # each new scan to those before it
     region: RegionOfInterest | None = None  # in effect where `region_is_on`
     region_is_on: bool = False
+    report_details: ReportDetails = field(default_factory=ReportDetails)  # of its title page
     faults: tuple[
         str, ...
     ] = ()  # what is damaged, or no capture, and missing here, with the remedy

@@ -552,3 +552,24 @@ def test_cloud_is_coloured_by_chosen_quantity() -> None:
     assert "measure this capture" in paint_cloud(cloud, "error")[1].replace("&#32;", " ")
     assert "600&#46;000" in point_html(cloud, 4, 2)
     assert colour_range(np.array([np.nan])) == (0.0, 1.0)
+
+
+@pytest.mark.slow
+def test_the_title_page_of_the_report_is_typed_once(
+    measured: tuple[Page, Operator, list[str]],
+) -> None:
+    page, operator, errors = measured
+    page.get_by_role("button", name=re.compile(r"^\d+\. Export")).click()
+    page.get_by_text("Title page", exact=True).click()
+    stated = {"Part": "Vase <b>", "Customer": "Acme", "Temperature, °C": "20,5"}
+    for label, text in stated.items():
+        field(page, label).fill(text)
+    click(page, "Write report")
+    expect(page.get_by_text("report.html", exact=True).first).to_be_visible()
+    details = operator.snapshot().content.report_details
+    assert (details.part, details.customer, details.temperature_c) == ("Vase <b>", "Acme", 20.5)
+    expect(field(page, "Temperature, °C")).to_have_value("20.5")
+    assert (
+        "Vase &lt;b&gt;" in (operator.snapshot().content.folder / "exports/report.html").read_text()
+    )
+    assert errors == []

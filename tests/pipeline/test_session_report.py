@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clocks import HANG_S
 from facts import raises
 from PIL import Image
 
@@ -25,6 +26,7 @@ from slviewer.report.surfaces import draw_photo
 from slviewer.session.ply import write_ply
 from slviewer.session.report_details import ReportDetails, encode_logo
 from slviewer.session.store import Session
+from slviewer.wizard.operator import Operator
 
 EVIL = "<script>alert(1)</script></style>"
 H, W = 30, 40
@@ -121,6 +123,22 @@ def test_the_title_page_shows_the_part_and_not_what_was_verified(session: Path) 
     assert "vase_2" in seen and "2 scans" in surface and "3 points" in surface
     (session / "exports" / "merged_1.ply").unlink()
     assert "vase_2" in pictures(written(session))[1]
+
+
+def test_the_wizard_remembers_the_title_page(tmp_path: Path) -> None:
+    image = io.BytesIO()
+    Image.new("RGBA", (60, 20)).save(image, "PNG")
+    with Operator(tmp_path / "session") as operator:
+        assert operator.set_report_details(part="Vase", temperature_c=-2.5)
+        assert operator.upload_logo("logo.png", image.getvalue())
+        assert not operator.upload_logo("logo.png", b"<svg/>")
+        assert not operator.set_report_details(customer="x" * 201)
+        assert operator.export("report")
+        operator.wait_until_idle(HANG_S)
+        details = operator.snapshot().content.report_details
+        page = next(operator.snapshot().content.folder.glob("exports/*.html")).read_text()
+    assert (details.part, details.temperature_c, details.customer) == ("Vase", -2.5, "")
+    assert details.logo and details.logo in page and "−2.5 °C" in page
 
 
 def test_the_photo_is_cut_to_the_part() -> None:

@@ -261,7 +261,7 @@ def test_results_come_first_and_all_limits_decide() -> None:
         page = make_title_page(dataclasses.replace(data, records=views, verdict=verdict))
         return page.verdict, page.kind
 
-    data = session_data(WIDTH)
+    data = dataclasses.replace(session_data(WIDTH), calibration=None, pixel_fits={})
     assert judged(None, "pass", "pass") == ("pass", "good")
     assert judged(None, "pass", "fail", "undecided") == ("fail", "bad")
     assert judged(None, "pass", "undecided") == ("undecided", "warning")

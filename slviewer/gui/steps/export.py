@@ -1,10 +1,11 @@
 """Step 9: write files for other programs, with their units and sizes, and download them."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from slviewer.errors import SlviewerError
+from slviewer.errors import InputError, SlviewerError
 from slviewer.gui.panel import PanelPart, StepPanel, scan_labels, scan_options
 from slviewer.gui.widgets import Html, Text, link, note, paragraph, records_html, table, to_html
 from slviewer.pipeline.export import (
@@ -18,6 +19,7 @@ from slviewer.pipeline.mesh import BOARD
 from slviewer.records.kinds import RECORDS
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import mesh_formats, point_formats
+from slviewer.session.report_details import FIELDS, ReportDetails
 from slviewer.surface.meshing import MeshingPlan, Method
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import ExportView, SessionView
@@ -94,6 +96,7 @@ class ExportPanel(StepPanel):
 
     key = "export"
     _drawn: SessionView | None = None
+    _drawn_details = ReportDetails()
 
     def build(self) -> None:
         """Create the inputs and lists of files."""
@@ -132,9 +135,20 @@ class ExportPanel(StepPanel):
         with gui.add_folder("Figures", expand_by_default=False) as self._figures_folder:
             self._figures = Text(gui)
         with gui.add_folder("Report and tables"):
-            self._report = self.button(
-                "Write report", lambda: operator.export("report"), "report", None
-            )
+            with gui.add_folder("Title page", expand_by_default=False):
+                self._details = {
+                    field: gui.add_text(
+                        f"{label}, °C" if field == "temperature_c" else label,
+                        "",
+                        hint="Optional; Write report remembers it",
+                    )
+                    for field, label in FIELDS.items()
+                }
+                self.upload_button("Upload logo", operator.upload_logo, ".png,.jpg,.jpeg,.webp")
+                self._logo = self.button(
+                    "Remove logo", lambda: operator.set_report_details(logo=""), "photo-off"
+                )
+            self._report = self.button("Write report", self._request_report, "report", None)
             self._table = self.button(
                 "Write figures",
                 lambda: operator.export("table"),
@@ -159,6 +173,7 @@ class ExportPanel(StepPanel):
         self._numbers.offer_names(k for k in NUMBERS if k != "coefficients" or coefficients)
         unusable = busy or bool(calibration and calibration.refused)
         self._report.disabled = busy or self.is_blocked
+        self._draw_details(session.report_details)
         self._write_numbers.disabled = unusable or self.is_blocked
         self._write.disabled = self._finish.disabled = unusable or not things
         self._table.disabled = busy or not session.records
@@ -170,6 +185,15 @@ class ExportPanel(StepPanel):
         self._request_cloud()
         self._describe_shape()
         self._describe_numbers()
+
+    def _draw_details(self, details: ReportDetails) -> None:
+        """Show the details of the title page that have changed; what is typed stays else."""
+        before, self._drawn_details = self._drawn_details, details
+        for field, handle in self._details.items():
+            value = getattr(details, field)
+            if value != getattr(before, field):
+                handle.value = "" if value is None else str(value)
+        self._logo.visible = bool(details.logo)
 
     def _get_shape(self) -> tuple[What, str]:
         """Return what is to be exported, and its name; empty where nothing is offered."""
@@ -243,6 +267,18 @@ class ExportPanel(StepPanel):
         self.show_cloud(self._source.value, points, (150, 150, 150) if colours is None else colours)
 
     # requests
+
+    def _request_report(self) -> None:
+        """Remember what was typed for the title page, and request the report. InputError for a
+        temperature that is no number."""
+        stated: dict[str, Any] = {field: each.value for field, each in self._details.items()}
+        text = stated["temperature_c"].replace(",", ".").strip()
+        try:
+            stated["temperature_c"] = float(text) if text else None
+        except ValueError as error:
+            raise InputError(f"{text!r} is no temperature: type °C, such as 20.5") from error
+        if self._operator.set_report_details(**stated):
+            self._operator.export("report")
 
     def _request_shape(self) -> None:
         """Request the file of the chosen cloud or mesh."""
