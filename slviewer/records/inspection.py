@@ -120,7 +120,8 @@ class Inspection(Record, frozen=True, kw_only=True):
 
     def summary(self) -> str:
         """Return which parts do not pass in one sentence."""
-        return f"{self.plan}: {self.failure or f'all {len(self.parts)} parts pass'}"
+        passed = "the part passes" if len(self.parts) == 1 else f"all {len(self.parts)} parts pass"
+        return f"{self.plan}: {self.failure or passed}"
 
     def figures(self) -> dict[str, float]:
         """Return the values of each part."""

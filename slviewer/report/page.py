@@ -187,7 +187,8 @@ def _render(
     environment.tests["table"] = lambda item: isinstance(item, Table)
     environment.filters["webp"] = pictures.__getitem__
     template = environment.from_string((here / "page.html.j2").read_text(encoding="utf-8"))
-    running = " · ".join(filter(None, (title, title_page and title_page.details.get("Order"))))
+    order = title_page.details.get("Order") if title_page else None
+    running = " · ".join(filter(None, (title, order)))
     return template.render(
         title=title,
         title_page=title_page,

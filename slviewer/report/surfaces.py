@@ -181,7 +181,8 @@ def draw_photo(name: str, texture: np.ndarray, points: np.ndarray) -> Figure:
     )
     shown = texture[top : top + size[1], left : left + size[0]]
     way = cv2.INTER_AREA if size[0] > width else cv2.INTER_CUBIC
-    image = cv2.resize(np.ascontiguousarray(shown), PICTURE, interpolation=way)
+    resized = cv2.resize(np.ascontiguousarray(shown), PICTURE, interpolation=way)
+    image = np.asarray(resized, np.uint8)
     rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
     words = f"The part as the camera sees it ({name})"
     return Figure(rgb, f"{words}.", words, HALF)

@@ -136,7 +136,7 @@ class ExportPanel(StepPanel):
             self._figures = Text(gui)
         with gui.add_folder("Report and tables"):
             with gui.add_folder("Title page", expand_by_default=False):
-                self._details = {
+                self._details: dict[str, Any] = {
                     field: gui.add_text(
                         f"{label}, °C" if field == "temperature_c" else label,
                         "",
