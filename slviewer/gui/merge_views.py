@@ -11,40 +11,42 @@ import numpy as np
 
 from slviewer.errors import SlviewerError
 from slviewer.evaluation import letter
+from slviewer.geometry.rigid import move_points
+from slviewer.gui.colouring import (
+    DISTANCE,
+    SCAN,
+    SCAN_COLOURS,
+    TEXTURE,
+    PointValues,
+    merge_values,
+    paint_points,
+    patch,
+)
 from slviewer.gui.panel import PanelPart, StepPanel
-from slviewer.gui.scene import TO_THE_RIGHT, Click, Colour
+from slviewer.gui.scene import TO_THE_RIGHT, Click
 from slviewer.gui.widgets import (
     Html,
     Text,
     alert,
     help_link,
     note,
-    paint,
     paragraph,
     records_html,
     table,
     to_html,
 )
 from slviewer.pipeline.stored_records import Stored
+from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.merge import Merge
 from slviewer.records.table import use_labels
 from slviewer.registration.multiway import Pair
 from slviewer.registration.refusal import Reason
+from slviewer.registration.spread import measure_spread
 from slviewer.registration.start import LEAST_PICKS, fit_picked_start
-from slviewer.session.ply import Ply
 from slviewer.session.store import Session
 from slviewer.wizard import result_views
 
-AFTER, BEFORE = "scans, aligned", "scans, as captured"
-OWN = "merged, texture"
-BY_SCAN = "merged, by scan"
-BY_SIGMA = "merged, uncertainty"
-MERGED = (OWN, BY_SCAN, BY_SIGMA)
-SCAN_COLOURS: tuple[Colour, ...] = (
-    (91, 143, 208), (224, 161, 60), (99, 178, 138), (200, 113, 143), (143, 131, 201),
-    (120, 120, 120),
-)  # fmt: skip
-_GREY: Colour = (150, 150, 150)
+MERGED, AFTER, BEFORE = "merged", "scans, aligned", "scans, as captured"
 SHOWN = 60_000
 """Points of each cloud that are drawn."""
 
@@ -58,7 +60,7 @@ class ColouredClouds:
     """
 
     view: str
-    clouds: Mapping[str, tuple[np.ndarray, np.ndarray | Colour]]
+    clouds: Mapping[str, tuple[np.ndarray, np.ndarray]]
     legend: Html
     scans: tuple[result_views.ScanCloud, ...] = ()
 
@@ -77,65 +79,44 @@ def colour_scans(
     names: Sequence[str],
     places: Mapping[str, np.ndarray],
     titles: Mapping[str, str],
+    colour: str = SCAN,
 ) -> ColouredClouds:
-    """Load scans, each in a colour, at their ``places`` (4, 4), or as captured where they have
-    none."""
+    """Load scans, coloured by one of ALIGNED_COLOURINGS, at their ``places`` (4, 4), or as captured
+    where they have none."""
     scans = tuple(result_views.load_scan_cloud(session, name) for name in names)
-    clouds: dict[str, tuple[np.ndarray, np.ndarray | Colour]] = {}
+    legend = Html("")
+    clouds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    categories = {SCAN: ([titles.get(name, name) for name in names], SCAN_COLOURS)}
     for i, cloud in enumerate(scans):
-        T = places.get(cloud.name, np.eye(4))
-        points = (cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-        clouds[cloud.name] = (points, SCAN_COLOURS[i % len(SCAN_COLOURS)])
-    legend = _format_patches([titles.get(name, name) for name in names])
+        T = places.get(cloud.name, np.eye(4)).astype(np.float32)
+        points = cloud.points @ T[:3, :3].T + T[:3, 3]
+        values = {TEXTURE: cloud.texture, SCAN: np.full(points.shape[:2], i)}
+        normals = cloud_normals(cloud) @ T[:3, :3].T
+        painted, legend = paint_points(
+            PointValues(points, normals, values, categories=categories), colour
+        )
+        clouds[cloud.name] = points, painted
     return ColouredClouds("after" if places else "before", clouds, legend, scans)
 
 
-def colour_merge(session: Session, merge: str, view: str, titles: Sequence[str]) -> ColouredClouds:
-    """Load the surface of a merge, coloured by one of MERGED; ``titles`` are those of its scans, in
-    order."""
-    surface = result_views.merged_cloud(session, merge)
-    legend, painted = _colour_surface(surface, view, titles)
+def colour_merge(
+    session: Session, merge: Stored[Merge], colour: str, titles: Sequence[str]
+) -> ColouredClouds:
+    """Load the surface of a merge, coloured by one of MERGE_COLOURINGS; ``titles`` are those of its
+    scans, in order."""
+    surface, spread = result_views.merged_cloud(session, merge.name), None
+    if colour == DISTANCE and surface.normals is not None:
+        aligned = []
+        for name in merge.record.scans:
+            if not session.has_result(f"clouds/{name}"):  # deleted since
+                continue
+            pair = merge.record.pairs.get(name)
+            T = np.eye(4) if pair is None else np.array(pair.T_reference_scan)
+            measured = result_views.load_scan_cloud(session, name).measured
+            aligned.append(move_points(T, measured))
+        spread = measure_spread(surface.points, surface.normals, aligned)
+    painted, legend = paint_points(merge_values(surface, titles, spread), colour)
     return ColouredClouds("merged", {"merged": (surface.points, painted)}, legend)
-
-
-def patch(colour: Colour) -> Html:
-    """Return a square of a colour, for a legend."""
-    return Html(f'<span style="color:rgb{colour};font-size:1.3em">■</span>')
-
-
-def _colour_surface(
-    surface: Ply, view: str, titles: Sequence[str]
-) -> tuple[Html, np.ndarray | Colour]:
-    """Return (legend, colours (n, 3)) of a merged surface by texture, scan or uncertainty; grey
-    where not stored."""
-    source, sigma = surface.scalars.get("source"), surface.scalars.get("sigma")
-    if view == BY_SCAN and source is not None:
-        palette = np.array(SCAN_COLOURS, np.uint8)
-        return _format_patches(titles), palette[source.astype(np.int64) % len(palette)]
-    if view == BY_SIGMA and sigma is not None:
-        known = np.where(sigma > 0, sigma, np.nan)
-        unknown = "" if np.isfinite(known).all() else "; grey: unknown"
-        title = f"uncertainty along the normal (1 sigma){unknown}"
-        painted, bar = paint(known, "mm", 3, title)
-        return bar, painted
-    if view != OWN:
-        return note("Not stored with this merge: merge again.", "warning"), _GREY
-    if surface.colours is None:
-        return note("The scans have no texture.", "warning"), _GREY
-    return Html(""), surface.colours
-
-
-def _format_patches(titles: Sequence[str]) -> Html:
-    """Return a legend with a coloured square and a title for each scan."""
-    items = [
-        f"<span>{patch(SCAN_COLOURS[i % len(SCAN_COLOURS)])} {to_html(title)}</span>"
-        for i, title in enumerate(titles)
-    ]
-    row = (
-        '<div style="display:flex;flex-wrap:wrap;gap:0'
-        f' 1em;align-items:center">{"".join(items)}</div>'
-    )
-    return paragraph(Html(row) if items else "")
 
 
 def merge_html(merge: Stored[Merge], labels: Mapping[str, str]) -> Html:

@@ -358,14 +358,16 @@ def fitted(image: np.ndarray, width_px: int = PICTURE_PX) -> np.ndarray:
     )
 
 
-_COLOUR_MAPS = {"value": "viridis", "error": "RdBu_r"}  # an error's: blue below, red above
+ColourScale = Literal["value", "amount", "error"]
+# an error's: blue below, red above; an amount's is light where there is none
+_COLOUR_MAPS: dict[ColourScale, str] = {"value": "viridis", "amount": "YlOrRd", "error": "RdBu_r"}
 
 
 def colours(
     values: NDArray[np.floating],
     low: float,
     high: float,
-    scale: Literal["value", "error"] = "value",
+    scale: ColourScale = "value",
 ) -> NDArray[np.uint8]:
     """Map values (...) to colours (..., 3) uint8 RGB over low ... high; middle grey where NaN."""
     from matplotlib import colormaps
@@ -375,9 +377,7 @@ def colours(
     return np.asarray(painter(np.ma.masked_invalid(np.clip(share, 0, 1)), bytes=True)[..., :3])
 
 
-def colour_bar(
-    low: str, high: str, scale: Literal["value", "error"] | NDArray[np.uint8], title: str
-) -> Html:
+def colour_bar(low: str, high: str, scale: ColourScale | NDArray[np.uint8], title: str) -> Html:
     """Return the legend of a colour scale, that of `colours` or colours (n, 3), from `low` to
     `high` with units."""
     palette = colours(np.linspace(0, 1, 9), 0, 1, scale) if isinstance(scale, str) else scale
@@ -394,13 +394,17 @@ def colour_bar(
 
 
 def paint(
-    values: NDArray[np.floating], unit: str, digits: int, title: str
+    values: NDArray[np.floating],
+    unit: str,
+    digits: int,
+    title: str,
+    scale: ColourScale = "value",
 ) -> tuple[NDArray[np.uint8], Html]:
     """Return (colours (..., 3) of values (...), their legend), from the 1st to the 99th percentile;
     grey where NaN."""
     low, high = colour_range(values)
-    bar = colour_bar(f"{low:.{digits}f} {unit}", f"{high:.{digits}f} {unit}", "value", title)
-    return colours(values, low, high), bar
+    bar = colour_bar(f"{low:.{digits}f} {unit}", f"{high:.{digits}f} {unit}", scale, title)
+    return colours(values, low, high, scale), bar
 
 
 def colour_range(values: NDArray[np.floating]) -> tuple[float, float]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from facts import missing_facts
 
+from slviewer.gui.colouring import paint_points, surface_values
 from slviewer.gui.measure_list import (
     cursor_html,
     cursor_points,
@@ -16,7 +17,7 @@ from slviewer.gui.measure_list import (
     measurement_html,
     measurements_table,
 )
-from slviewer.gui.steps.measure import COMPARE, FIT, PICK, Tool, paint_surface
+from slviewer.gui.steps.measure import COMPARE, FIT, PICK, Tool
 from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane
@@ -189,9 +190,9 @@ def test_a_merge_is_painted_and_clicked_as_a_scan_is() -> None:
         texture=np.full((5, 3), 9, np.uint8),
     )
     assert place_at(merge, np.zeros(3), points[3]) == 3
-    drawn_points, painted, _ = paint_surface(merge, "texture")
-    assert drawn_points.shape == painted.shape == (5, 3) and painted.max() == 9
-    assert "normal" in text(paint_surface(merge, "uncertainty")[2])
+    painted, _ = paint_points(surface_values(merge), "texture")
+    assert painted.shape == (5, 3) and painted.max() == 9
+    assert "normal" in text(paint_points(surface_values(merge), "uncertainty")[1])
     scan = MeasuredSurface(points[None], np.full((1, 5), 0.1, np.float32), "scan_01", "stereo", {})
     assert place_at(scan, np.zeros(3), points[3]) == (3, 0)
-    assert "depth" in paint_surface(scan, "texture")[2]  # where there is no texture
+    assert "no texture" in text(paint_points(surface_values(scan), "texture")[1])

@@ -7,11 +7,17 @@ from typing import Any
 import numpy as np
 from facts import missing_facts
 
-from slviewer.gui.merge_views import (
-    BY_SCAN,
-    BY_SIGMA,
-    OWN,
+from slviewer.gui.colouring import (
+    DISTANCE,
+    SCAN,
     SCAN_COLOURS,
+    SHAPE,
+    TEXTURE,
+    UNCERTAINTY,
+    PointValues,
+    paint_points,
+)
+from slviewer.gui.merge_views import (
     colour_merge,
     merge_failure_html,
     merge_html,
@@ -118,20 +124,36 @@ def test_merged_points_by_scan_and_by_uncertainty(tmp_path: Path) -> None:
             scalars,
         )
         write_ply(store.exports / "merged_2.ply", points)
+        merges = []
         for number in ("1", "2"):
             made = Merge(reference="a", scans=["a"], pairs={}, ply=f"merged_{number}.ply")
             save_record(store, number, made, {})
-        by_scan = colour_merge(store, "1", BY_SCAN, ["a", "b", "<c>"])
+            merges.append(Stored(number, number, made))
+        by_scan = colour_merge(store, merges[0], SCAN, ["a", "b", "<c>"])
         assert by_scan.clouds["merged"][1][3].tolist() == list(
             SCAN_COLOURS[2]
         ) and "<c>" in unescape(by_scan.legend)
-        by_sigma = colour_merge(store, "1", BY_SIGMA, [])
+        by_sigma = colour_merge(store, merges[0], UNCERTAINTY, [])
         assert by_sigma.clouds["merged"][1][3].tolist() == [128, 128, 128]
         legend = unescape(by_sigma.legend).replace("\xa0", " ")
         assert missing_facts(legend, "0.010 mm", "grey") == []
-        assert colour_merge(store, "1", OWN, []).clouds["merged"][1][1].tolist() == [20, 20, 20]
+        assert colour_merge(store, merges[0], TEXTURE, []).clouds["merged"][1][1].tolist() == [
+            20,
+            20,
+            20,
+        ]
         assert (
-            missing_facts(unescape(colour_merge(store, "2", BY_SCAN, []).legend), "merge again")
+            missing_facts(unescape(colour_merge(store, merges[1], SCAN, []).legend), "merge again")
             == []
         )
         assert by_sigma.points.shape == (4, 3) and by_sigma.view == by_scan.view
+
+
+def test_shape_is_darker_where_it_turns_from_the_light() -> None:
+    points = np.zeros((3, 3), np.float32)
+    normals = np.array([[-0.35, -0.5, -0.79], [0, 0, 1], [np.nan] * 3], np.float32)
+    painted, legend = paint_points(PointValues(points, normals, {}), SHAPE)
+    assert painted[0, 0] > painted[2, 0] > painted[1, 0] > 0 and legend == ""
+    scan = np.array([0.0, 0.001, np.nan], np.float32)
+    painted, legend = paint_points(PointValues(points, normals, {DISTANCE: scan}), DISTANCE)
+    assert missing_facts(unescape(legend).replace("\xa0", " "), "1 µm", "unknown") == []

@@ -31,9 +31,10 @@ from wizard_page import (
 )
 
 from slviewer.gui.app import App
+from slviewer.gui.colouring import paint_points, scan_values, uncertainty
 from slviewer.gui.panel import Painter, display_name
 from slviewer.gui.steps.calibrate import named_poses, verdict_html
-from slviewer.gui.steps.scan import paint_cloud, point_html, sort_scans, uncertainty
+from slviewer.gui.steps.scan import point_html, sort_scans
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html
 from slviewer.pipeline.accept import gather_results
@@ -217,7 +218,7 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible()
     expect(page.get_by_text(re.compile(r"^0\.\d{3}$")).first).to_be_visible()
     expect(page.get_by_text("Not merged.")).to_be_hidden()
-    choose(page, "3D view", "merged, uncertainty")
+    choose(page, "Colour", "uncertainty")
     expect(page.get_by_text("uncertainty along the normal (1 sigma)")).to_be_visible()
     choose(page, "3D view", "scans, as captured")
 
@@ -540,16 +541,18 @@ def test_cloud_is_coloured_by_chosen_quantity() -> None:
     cloud = ScanCloud(
         points, "x", "stereo", flat, name="a", phase=flat, modulation=flat, texture=grey, errors={}
     )
-    painted, words = paint_cloud(cloud, "depth")
+    painted, words = paint_points(scan_values(cloud), "depth")
     assert painted.shape == (4, 5, 3) and len(np.unique(painted[1], axis=0)) == 5 and "mm" in words
     noisy = replace(cloud, sigma_z=3 * flat, sigma_calibration=4 * flat)
     np.testing.assert_allclose(uncertainty(noisy)[1:, 1:], 5.0)
-    assert "5&#46;000" in paint_cloud(noisy, "uncertainty")[1] and "5&#46;000" in point_html(
-        noisy, 4, 2
+    assert "5&#46;000" in paint_points(scan_values(noisy), "uncertainty")[
+        1
+    ] and "5&#46;000" in point_html(noisy, 4, 2)
+    assert "noise only" in paint_points(scan_values(cloud), "uncertainty")[1].replace("&#32;", " ")
+    assert paint_points(scan_values(cloud), "texture")[0][0, 0].tolist() == [7, 7, 7]
+    assert "measure this capture" in paint_points(scan_values(cloud), "error")[1].replace(
+        "&#32;", " "
     )
-    assert "noise only" in paint_cloud(cloud, "uncertainty")[1].replace("&#32;", " ")
-    assert paint_cloud(cloud, "texture")[0][0, 0] == 7
-    assert "measure this capture" in paint_cloud(cloud, "error")[1].replace("&#32;", " ")
     assert "600&#46;000" in point_html(cloud, 4, 2)
     assert colour_range(np.array([np.nan])) == (0.0, 1.0)
 

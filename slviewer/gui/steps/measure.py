@@ -7,11 +7,12 @@ from typing import Any, cast
 
 import numpy as np
 
+from slviewer.gui.colouring import SURFACE_COLOURINGS, paint_points, surface_values
 from slviewer.gui.measure_list import InspectionInputs, MeasurementList
 from slviewer.gui.panel import NO_SESSION, PanelPart, StepPanel, scan_options
 from slviewer.gui.scene import Click, Drag
 from slviewer.gui.steps.scan import sort_scans
-from slviewer.gui.widgets import Html, Text, colour_bar, note, paint, to_html
+from slviewer.gui.widgets import Html, Text, colour_bar, note, to_html
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
@@ -24,7 +25,6 @@ from slviewer.session.nominal import MM, Units
 from slviewer.wizard.result_views import box_in_view, place_at, point_at
 from slviewer.wizard.snapshot import SessionView
 
-COLOURS = ("texture", "depth", "uncertainty")
 DEVIATION = "deviation"
 
 
@@ -38,7 +38,7 @@ class SurfaceView(PanelPart):
         """Create the inputs."""
         self._versions: dict[str, Any] = {}
         self._choice = self.choice("Surface")
-        self._colour = self.dropdown("Colour", COLOURS)
+        self._colour = self.dropdown("Colour", SURFACE_COLOURINGS)
         self._legend = Text(self._gui)
 
     @property
@@ -69,7 +69,7 @@ class SurfaceView(PanelPart):
             if measured.record.deviation is None:
                 measured = None
         self._deviation = measured
-        options = COLOURS if measured is None else (*COLOURS, DEVIATION)
+        options = SURFACE_COLOURINGS if measured is None else (*SURFACE_COLOURINGS, DEVIATION)
         if self._colour.options != options:
             self._colour.options = options  # a colour that is no longer offered becomes the first
         if measured:
@@ -107,7 +107,8 @@ class SurfaceView(PanelPart):
             """Load the surface; returns (surface, points, colours, legend)."""
             on = self._operator.surface(name)
             if shown is None:
-                return (on, *paint_surface(on, COLOURS[0] if colour == DEVIATION else colour))
+                default = SURFACE_COLOURINGS[0] if colour == DEVIATION else colour
+                return (on, on.points, *paint_points(surface_values(on), default))
             assert shown.record.deviation is not None
             arrays = load_arrays(self.context.session, f"{Measurement.kind}/{shown.name}")
             return (on, *_colour_by_deviation(arrays, shown.record.deviation.tolerance_mm))
@@ -124,18 +125,6 @@ class SurfaceView(PanelPart):
         if is_new:
             self.redraw()
         self.panel.show_points(on.source, on.points)
-
-
-def paint_surface(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
-    """Colour a surface by one of COLOURS: (points (..., 3), their colours (..., 3), the legend)."""
-    if colour == "texture" and on.texture is not None:
-        return on.points, on.texture, Html("")
-    if colour == "uncertainty":
-        sigma = on.sigma_mm if on.left_mm is None else np.hypot(on.sigma_mm, on.left_mm)
-        what = "uncertainty of z" if on.organised else "uncertainty along the normal"
-        title = f"{what} (1 sigma){'' if on.left_mm is not None else ', noise only'}"
-        return on.points, *paint(np.where(on.measured, sigma, np.nan), "mm", 3, title)
-    return on.points, *paint(on.points[..., 2], "mm", 1, "depth")
 
 
 def _colour_by_deviation(

@@ -4,6 +4,7 @@ after."""
 import numpy as np
 import viser
 
+from slviewer.gui.colouring import ALIGNED_COLOURINGS, DISTANCE, MERGE_COLOURINGS
 from slviewer.gui.merge_views import (
     AFTER,
     BEFORE,
@@ -75,6 +76,7 @@ class MergePanel(StepPanel):
         self._result = Text(gui)
         self._undo = self.button("Undo merge", operator.undo_merge, "arrow-back-up", "orange")
         self._view = self.choice("3D view")
+        self._colour = self.choice("Colour")
         self._legend = Text(gui)
         self._editing = PointEditing(self, self._redraw)
 
@@ -98,8 +100,11 @@ class MergePanel(StepPanel):
         self._offer_views()
         number = int(merge.name) if merge else 0
         if self._merged is not None and number > self._merged:
-            self._view.choose(AFTER)  # show what was just merged
+            self._view.choose(MERGED)  # show what was just merged
+            self._offer_colours()
+            self._colour.choose(DISTANCE)
         self._merged = number
+        self._offer_colours()
         self._draw_choice(labels)
 
     def show(self, visible: bool) -> None:
@@ -128,11 +133,17 @@ class MergePanel(StepPanel):
     def _offer_views(self) -> None:
         """Offer the 3D views: before and after the merge, merged, or side by side to pick
         points."""
-        views = [AFTER, BEFORE, *MERGED] if self.session.merge else [BEFORE]
+        views = [MERGED, AFTER, BEFORE] if self.session.merge else [BEFORE]
         if self._start.value == PICKED:
             views.append(SIDE_BY_SIDE)
         self._view.offer_names(views)
         self._view.handle.visible = len(views) > 1
+
+    def _offer_colours(self) -> None:
+        """Offer what can colour the points of the chosen view."""
+        merged = self._view.value == MERGED
+        self._colour.offer_names(MERGE_COLOURINGS if merged else ALIGNED_COLOURINGS)
+        self._colour.handle.visible = not self._is_picking
 
     def _propose_start(self) -> None:
         """Choose the initial alignment that the chosen scans bring along, unless the operator chose
@@ -196,7 +207,7 @@ class MergePanel(StepPanel):
         shown = [
             scan for scan in session.scans if scan.name in self._versions and scan.name in listed
         ]
-        editable = self._view.value not in MERGED and not self._is_picking
+        editable = self._view.value != MERGED and not self._is_picking
         self._editing.offer(shown if editable else [])
         self._show_layers()
         if not self._is_picking:
@@ -215,6 +226,7 @@ class MergePanel(StepPanel):
     def _request_clouds(self, shown: list[str], labels: dict[str, str]) -> None:
         """Request the clouds of the chosen view: the merged surface, or these scans."""
         merge, view, context = self.session.merge, self._view.value, self.context
+        colour = self._colour.value
         poses = (
             {n: np.array(p.T_reference_scan) for n, p in merge.record.pairs.items()}
             if merge and view == AFTER
@@ -222,6 +234,7 @@ class MergePanel(StepPanel):
         )
         key = (
             view,
+            colour,
             merge.name if merge else "",
             tuple((name, self._versions[name], labels[name]) for name in shown),
             tuple((name, T.tobytes()) for name, T in poses.items()),
@@ -229,10 +242,10 @@ class MergePanel(StepPanel):
 
         def make() -> ColouredClouds:
             """Load and colour the merged surface or the scans."""
-            if merge and view in MERGED:
+            if merge and view == MERGED:
                 titles = [labels.get(name, name) for name in merge.record.scans]
-                return colour_merge(context.session, merge.name, view, titles)
-            return colour_scans(context.session, shown, poses, labels)
+                return colour_merge(context.session, merge, colour, titles)
+            return colour_scans(context.session, shown, poses, labels, colour)
 
         self.painter.request(self._draw_clouds, key, make)
 

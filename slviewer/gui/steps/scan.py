@@ -9,6 +9,15 @@ import viser
 from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.gui.capture_inputs import ExposureInputs, ImportInputs, SimulatedObject, TurnInputs
+from slviewer.gui.colouring import (
+    SCAN_COLOURINGS,
+    SEEN_COLOURS,
+    SEEN_TITLES,
+    format_patches,
+    paint_points,
+    scan_values,
+    uncertainty,
+)
 from slviewer.gui.live import LiveScreen
 from slviewer.gui.panel import RestoreButton, StepPanel, display_name, scan_options
 from slviewer.gui.point_editing import PointEditing, RegionInputs
@@ -20,11 +29,8 @@ from slviewer.gui.widgets import (
     Text,
     Tone,
     alert,
-    colour_bar,
     coloured,
-    colours,
     note,
-    paint,
     paragraph,
     properties_table,
     thumbnail,
@@ -32,18 +38,20 @@ from slviewer.gui.widgets import (
 )
 from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
 from slviewer.records.verification import Verification
-from slviewer.report.maps import error_limit
 from slviewer.simulation.concave import CONCAVE
 from slviewer.wizard.result_views import ScanCloud, used_points, whole_cloud
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView
 
 SMALL_PX = 380
 """Width of the live image: the cloud matters more here."""
-COLOURS = ("texture", "depth", "modulation", "noise", "uncertainty", "error")
-SEEN_ONCE, SEEN_AGAIN = (232, 140, 30), (20, 150, 140)
 ONE, ALIGNED = "one", "aligned"
 LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capture"
 _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibration"}
+
+
+_Made = tuple[ScanCloud, ScanCloud, tuple[np.ndarray, Html], str]
+"""The cloud that is drawn, what is used of it, its colours with their legend, and why nothing is
+used."""
 
 
 class ScanPanel(StepPanel):
@@ -54,8 +62,7 @@ class ScanPanel(StepPanel):
     _known: tuple[str, ...] = ()
     _placed: tuple[str, ...] | None = None
     _loaded: tuple[Any, ScanCloud] | None = None
-    _made: tuple[ScanCloud, ScanCloud, str, str] | None = None
-    """The cloud that is drawn, what is used of it, its colours, and why nothing is used."""
+    _made: _Made | None = None
 
     def build(self) -> None:
         """Create the inputs of capture, live scan, gallery and cloud."""
@@ -116,7 +123,7 @@ class ScanPanel(StepPanel):
                 "Undo edit brings it back",
             )  # fmt: skip
             self._view = self.choice("3D view")
-            self._colour = self.dropdown("Colour", COLOURS)
+            self._colour = self.dropdown("Colour", SCAN_COLOURINGS)
             self._legend = Text(gui)
             self._point = Text(gui)
             self._region = RegionInputs(self)
@@ -261,16 +268,16 @@ class ScanPanel(StepPanel):
         key = (scan.name, scan.figures.model, scan.figures.points, scan.figures.noise_mm, verified)
         colour = self._colour.value
 
-        def make() -> tuple[ScanCloud, ScanCloud, str, str]:
-            """Load the cloud, unless it is loaded already; returns it, what is used of it, the
-            chosen colours, and why nothing is used."""
+        def make() -> _Made:
+            """Load the cloud, unless it is loaded already, and colour what is used of it."""
             if self._loaded is None or self._loaded[0] != key:
                 self._loaded = key, whole_cloud(self.context.session, scan.name)
-            whole = self._loaded[1]
+            whole, why = self._loaded[1], ""
             try:
-                return whole, used_points(self.context.session, whole), colour, ""
+                cloud = used_points(self.context.session, whole)
             except InputError as error:  # all is shown, so that the region can be put around it
-                return whole, whole, colour, str(error)
+                cloud, why = whole, str(error)
+            return whole, cloud, paint_points(scan_values(cloud), colour), why
 
         used = session.restriction(scan.name)
         self.painter.request(self._draw_cloud, (key, used, colour), make)
@@ -296,7 +303,7 @@ class ScanPanel(StepPanel):
         if self._is_live:
             return
         self._forget_cloud()
-        painted = np.where(aligned.seen_by[:, None] > 1, SEEN_AGAIN, SEEN_ONCE)
+        painted = np.array(SEEN_COLOURS)[(aligned.seen_by > 1).astype(int)]
         # shows the relief
         painted = (painted * (0.35 + 0.65 * np.clip(aligned.facing, 0, 1))[:, None]).astype(
             np.uint8
@@ -309,14 +316,13 @@ class ScanPanel(StepPanel):
         if self._made:
             self._draw_cloud(self._made)
 
-    def _draw_cloud(self, made: tuple[ScanCloud, ScanCloud, str, str]) -> None:
+    def _draw_cloud(self, made: _Made) -> None:
         """Draw what is used of a loaded cloud in the chosen colours, unless a live scan runs."""
-        whole, cloud, colour, why = made
+        whole, cloud, (painted, bar), why = made
         if self._is_live:
             return
         is_new = self._made is None or whole is not self._made[0]
         self._made = made
-        painted, bar = paint_cloud(cloud, colour)
         (points,) = self._editing.set_scans([(cloud, cloud.points)])
         shown = self.layer.cloud("cloud", points, painted)
         removed = int(whole.measured_count - cloud.measured_count)
@@ -339,13 +345,9 @@ class ScanPanel(StepPanel):
 
 def aligned_html(aligned: AlignedScans) -> Html:
     """State what the colours of the aligned scans mean."""
-    marks = "&ensp;".join(
-        f"<span style='color:rgb{colour}'>■</span> {text}"
-        for colour, text in ((SEEN_ONCE, "seen by one scan"), (SEEN_AGAIN, "by more than one"))
-    )
     share = f"{100 * aligned.share_seen_again:.0f} % is seen by more than one"
     text = coloured(f"{share}; gaps were not seen yet.", "dim")
-    return paragraph(Html(f"<div>{marks}</div>{text}"))
+    return format_patches(SEEN_TITLES, SEEN_COLOURS) + paragraph(text)
 
 
 def live_html(live: LiveView, shown: int) -> Html:
@@ -362,42 +364,6 @@ def live_html(live: LiveView, shown: int) -> Html:
         return paragraph(Html(html)) + alert(text, "warning")
     text = f"{live.points:,} points, {shown:,} shown; moving parts are masked."
     return paragraph(Html(html)) + note(f"{text} Nothing is saved yet.")
-
-
-def paint_cloud(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
-    """Colour a cloud by one of COLOURS: ((h, w) grey levels or (h, w, 3) RGB, uint8; the
-    legend)."""
-    if colour == "error":
-        if not cloud.errors:
-            grey = np.full(cloud.points.shape, 150, np.uint8)
-            return grey, note("No errors yet: measure this capture in the step Verify.", "warning")
-        model = cloud.model if cloud.model in cloud.errors else next(iter(cloud.errors))
-        limit = error_limit(list(cloud.errors.values()))
-        bar = colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", f"error of {model}")
-        return colours(cloud.errors[model], -limit, limit, "error"), bar
-    if colour == "texture":
-        return cloud.texture, Html("")
-    title = colour
-    if colour == "uncertainty":
-        title = "uncertainty of z (1 sigma), noise and calibration"
-        if cloud.sigma_calibration is None:
-            title = f"uncertainty of z (1 sigma), noise only: unknown for the model {cloud.model}"
-    values, unit, digits = {
-        "depth": (cloud.points[..., 2], "mm", 1),
-        "modulation": (cloud.modulation, "grey levels", 0),
-        "noise": (cloud.sigma_z, "mm", 3),
-        "uncertainty": (uncertainty(cloud), "mm", 3),
-    }[colour]
-    return paint(np.where(np.isfinite(cloud.points[..., 2]), values, np.nan), unit, digits, title)
-
-
-def uncertainty(cloud: ScanCloud) -> np.ndarray:
-    """Return the standard deviation of z (h, w) mm from noise, calibration and edges, as far as
-    known."""
-    sigma = np.where(np.isfinite(cloud.points[..., 2]), cloud.sigma_z, np.nan)
-    for part in (cloud.sigma_calibration, cloud.sigma_edges):
-        sigma = sigma if part is None else np.hypot(sigma, part)
-    return np.asarray(sigma)
 
 
 def point_html(cloud: ScanCloud, u: int, v: int) -> Html:
