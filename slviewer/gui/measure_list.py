@@ -269,7 +269,9 @@ class MeasurementList(PanelPart):
         self._restore.visible = session.deleted_measurements > 0
         self._file.set(self.context.links_html(session.exports, TABLE, PLAN))
         chosen = next((each for each in measured if each.name == self._choice.value), None)
-        self.chosen, self.is_other = chosen, (chosen and chosen.name) != before
+        # at the opening of a session the surface stays as it is
+        self.is_other = (chosen and chosen.name) != before and (bool(new) or before is not None)
+        self.chosen = chosen
         labels = scan_labels(session)
         if merge := session.merge:
             labels[f"merge/{merge.name}"] = f"merge of {len(merge.record.scans)} scans"

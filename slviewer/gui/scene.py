@@ -93,6 +93,11 @@ class SceneLayer:
         self._root: Any = api.add_frame(f"/{name}", show_axes=False)
         self._nodes: dict[str, Any] = {}
 
+    def hover_html(self, name: str) -> str:
+        """Return what makes the page show, while the pointer moves, which point of an object a
+        click would pick, as long as it is part of a visible panel."""
+        return f'<i data-hover="{self._make_path(name)}"></i>'
+
     def show(self, visible: bool) -> None:
         """Show or hide everything in the layer, now and when it is filled later."""
         self._root.visible = visible

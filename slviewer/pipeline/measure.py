@@ -4,6 +4,7 @@ are listed, renamed, deleted and written as CSV."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -155,7 +156,10 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
     fields, arrays = makers.get(settings.what, _fit)(on, settings)
     fields["warnings"] = (*on.errors.warnings, *fields.get("warnings", ()))
     record = Measurement(
-        what=settings.what, name=clean_label(settings.name), **provenance(on), **fields
+        what=settings.what,
+        name=clean_label(settings.name) or next_label(store, settings.what),
+        **provenance(on),
+        **fields,
     )
     used = replace(settings, model=on.model)  # type: ignore[arg-type]
     notes = uncertainty_notes(store, record)
@@ -363,6 +367,12 @@ def export_measurements(store: Session, out: Path | str) -> int:
     found = list_records(store, Measurement)
     replace_file(out.absolute(), format_measurements(found).encode("utf-8-sig"))
     return len(found)
+
+
+def next_label(store: Session, what: str) -> str:
+    """Return the first of the names "point 1", "point 2" ... that no measurement has."""
+    used = {each.label for each in list_records(store, Measurement)}
+    return next(name for name in (f"{what} {n}" for n in count(1)) if name not in used)
 
 
 def rename_measurement(store: Session, name: str, label: str) -> Stored[Measurement]:

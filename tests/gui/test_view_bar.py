@@ -1,5 +1,6 @@
 """The bar over the 3D view: standard views, fit, orthographic, and the scale bar."""
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -26,9 +27,11 @@ def server() -> Iterator[SafeServer]:
 def clicks(server: SafeServer) -> list[Click]:
     """The clicks into a scene with one cloud."""
     server.viser.initial_camera.fov = FIELD_OF_VIEW
-    scene, clicks = ViewerScene(server.viser.scene, lambda do: do()), list[Click]()
+    scene, clicks = ViewerScene(server.viser, lambda do: do()), list[Click]()
     corners = MIDDLE + SIZE * (np.random.default_rng(1).random((4000, 3)) - 0.5)
-    scene.layer("scan").cloud("cloud", corners.astype(np.float32), (90, 140, 200))
+    layer = scene.layer("scan")
+    server.viser.gui.add_html(layer.hover_html("cloud"))
+    layer.cloud("cloud", corners.astype(np.float32), (90, 140, 200))
     scene.on_click(clicks.append)
     return clicks
 
@@ -73,12 +76,15 @@ def test_standard_views_fit_and_orthographic(
 
     press(page, "Ortho")
     wait_until(page, lambda: view(server).fov < 0.01)
-    wait_until(page, lambda: view(server).position[2] < 20 * wide)
-    assert bar.inner_text() == length  # what is in the middle keeps its size
+    wait_until(page, lambda: view(server).position[2] < -20 * wide)
+    expect(bar).to_have_text(length)  # what is in the middle keeps its size
     press(page, "Fit")  # the same frame, but for the depth that no longer matters
     canvas = page.locator("canvas").first.bounding_box()
     assert canvas is not None
     x, y = canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2
+    page.mouse.move(x, y)
+    readout = page.locator("#point-readout span")
+    expect(readout).to_have_text(re.compile(r"^x [34]\d\.\d\d, y -2\d\.\d\d, z \d+\.\d\d mm$"))
     page.mouse.click(x, y)
     wait_until(page, lambda: clicks)
     near = clicks[0].origin  # as if from the wide view: a share of its depth is as many pixels

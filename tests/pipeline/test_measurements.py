@@ -212,9 +212,11 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
         two = measure(store, balls, "distance", b, a, name="back")
         trash_measurement(store, two.name)
         three = measure(store, balls, "distance", a, b)
-        assert three.name == "m3"  # an id that was deleted can come back
+        # an id that was deleted can come back; names count without gaps, each kind for itself
+        assert three.name == "m3" and three.label == "distance 2"
+        assert measure(store, balls, "point", a).label == "point 1"
         assert restore_measurement(store).label == "back"
-        assert [each.name for each in load_measurements(store)] == ["m1", "m2", "m3"]
+        assert [each.name for each in load_measurements(store)] == ["m1", "m2", "m3", "m4"]
         with raises(InputError):
             restore_measurement(store)
         with raises(InputError, "'m9'", "m1", "m2", "m3"):

@@ -33,6 +33,7 @@ class SurfaceView(PanelPart):
 
     on: MeasuredSurface | None = None
     _deviation: Stored[Measurement] | None = None
+    _merge = ""
 
     def build(self) -> None:
         """Create the inputs."""
@@ -49,7 +50,7 @@ class SurfaceView(PanelPart):
     def offer(self, session: SessionView) -> None:
         """Offer the surfaces that can be measured on, and draw the chosen one."""
         scans = [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"]
-        offered = scan_options(scans)
+        offered: dict[str, str] = {}
         self._versions = {
             scan.name: (session.folder, scan.figures, *session.restriction(scan.name))
             for scan in scans
@@ -58,7 +59,10 @@ class SurfaceView(PanelPart):
         if merge and not merge.stale:
             name = offered[f"Merge of {len(merge.record.scans)} scans"] = f"{MERGED}{merge.name}"
             self._versions[name] = (session.folder, merge.record.points)
-        self._choice.offer(offered)
+        self._choice.offer(offered | scan_options(scans))
+        before, self._merge = self._merge, next(iter(offered.values()), "")
+        if self._merge != before:
+            self._choice.choose(self._merge)  # what the scans were merged for
         self._request()
 
     def show_measurement(self, measured: Stored[Measurement] | None) -> None:
@@ -357,7 +361,9 @@ class MeasurePanel(StepPanel):
         """Show the instruction and the inputs of the tool."""
         tool = self._tool
         title = f"<b>{to_html(tool.name)}</b>: " if tool.name else ""
-        text = Html(title + to_html(tool.instruction))
+        clicks = tool.clicks and not (tool.fits and tool.by_rectangle)
+        hover = self.layer.hover_html("surface") if clicks else ""
+        text = Html(title + to_html(tool.instruction) + hover)
         self._instruction.write(text, "info" if tool.name else "dim")
         self._end.visible = bool(tool.name)
         self._by.visible = tool.fits

@@ -327,7 +327,8 @@ class ScanPanel(StepPanel):
         shown = self.layer.cloud("cloud", points, painted)
         removed = int(whole.measured_count - cloud.measured_count)
         kept = f", {removed:,} removed by edits and region" if removed else "; the file has all"
-        text = f"{shown:,} points shown{kept}. Click a point for its values."
+        text = Html(to_html(f"{shown:,} points shown{kept}. Click a point for its values."))
+        text = Html(text + self.layer.hover_html("cloud"))
         self._legend.set(bar + note(text) + alert(why, "warning"))
         if is_new:
             self._forget_point()
