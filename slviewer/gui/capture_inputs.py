@@ -169,7 +169,6 @@ class TurnInputs(PanelPart):
                     int(self._steps.value), float(self._range.value), then_merge=merge.value
                 ),
                 "rotate-360",
-                None,
             )
             self._resume = self.button(
                 "Resume turn",
@@ -298,7 +297,6 @@ class ImportInputs(PanelPart):
                 "Import folder",
                 lambda: self._operator.import_folder(folder.value, **self._collect_options()),
                 "folder-symlink",
-                None,
             )
             self._upload = self.upload_button(
                 "Upload zip",

@@ -229,12 +229,9 @@ class MeasurementList(PanelPart):
                 "Delete result",
                 lambda: operator.delete_measurement(choice.value),
                 "trash",
-                "red",
                 hint="Moves it to the session's trash",
             )
-        self._restore = self.button(
-            "Restore deleted", operator.undo_delete, "arrow-back-up", "orange"
-        )
+        self._restore = self.button("Restore deleted", operator.undo_delete, "arrow-back-up")
         with gui.add_folder("All results") as self._table_folder:
             self._table = Text(gui)
             self.button("Write CSV", operator.export_measurements_table, "table-export")

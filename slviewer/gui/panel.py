@@ -34,7 +34,8 @@ TYPING_S = 1.0
 NO_SESSION = SessionView(Path(), "", "")
 """What panels show while no session is open."""
 
-ButtonColour = Literal["gray", "red", "orange", "green", "teal", "cyan"]
+ButtonColour = Literal["gray"]
+"""A secondary button's; the main action of a step has the accent colour, None."""
 
 
 def start_worker(name: str) -> Callable[[Callable[[], Any]], None]:
@@ -77,6 +78,8 @@ class PanelContext:
         self.lock = threading.RLock()
         self._toasts: dict[int, viser.NotificationHandle] = {}  # the latest of each browser
         self._toast = 0, 0.0  # rank of the latest one's level, and when it ends
+        self.main_buttons: list[viser.GuiButtonHandle] = []
+        """Of all steps; secondary while their step is done, as the next one follows."""
 
     @property
     def session(self) -> Session:
@@ -364,13 +367,15 @@ class ControlGroup:
         hint: str | None = None,
         at_once: bool = False,
     ) -> viser.GuiButtonHandle:
-        """Add a button that calls `do()`; without a colour it is the panel's main action.
+        """Add a button that calls `do()`; without a colour it is the step's main action.
 
         `icon`: the name of one of Tabler's icons.
         """
         name = None if icon is None else viser.IconName(icon)
         handle = self._gui.add_button(label, icon=name, color=color, hint=hint)
         self.react(handle.on_click, do, at_once=at_once)
+        if color is None:
+            self.context.main_buttons.append(handle)
         return handle
 
     def button_group(self, label: str, names: Sequence[str], do: Callable[[str], Any]) -> Any:
@@ -465,6 +470,11 @@ class StepPanel(ControlGroup):
         """Whether the step cannot be done yet."""
         return self.snapshot.step(self.key).state == "blocked"
 
+    @property
+    def is_done(self) -> bool:
+        """Whether the step has its result."""
+        return self.snapshot.step(self.key).state == "done"
+
     def show_points(self, name: str, points: np.ndarray | None) -> None:
         """Move the browsers' views to what is shown now, points (..., 3) mm, or once the panel is
         visible."""
@@ -527,7 +537,7 @@ class RestoreButton(PanelPart):
     def build(self) -> None:
         """Create the button."""
         self._button = self.button(
-            "Restore", lambda: self._operator.undelete(self._name), "arrow-back-up", "orange"
+            "Restore", lambda: self._operator.undelete(self._name), "arrow-back-up"
         )
 
     def offer(self, deleted: Sequence[str]) -> None:

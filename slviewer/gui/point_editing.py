@@ -112,11 +112,11 @@ class PointEditing(PanelPart):
             self._hide = self.button("Hide selected", self._hide_selected, "eye-off")
             self._show = self.button("Show hidden", self._show_hidden, "eye")
             self._delete = self.button(
-                "Delete selected", self._delete_selected, "eraser", "red",
+                "Delete selected", self._delete_selected, "eraser",
                 hint="The scan on disk stays as it is: Undo brings the points back",
             )  # fmt: skip
             self._undo = self.button(
-                "Undo edit", lambda: operator.undo_edit(*self._names), "arrow-back-up", "orange"
+                "Undo edit", lambda: operator.undo_edit(*self._names), "arrow-back-up"
             )
             self._redo = self.button(
                 "Redo edit", lambda: operator.redo_edit(*self._names), "arrow-forward-up"

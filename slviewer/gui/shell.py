@@ -10,6 +10,7 @@ import importlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Literal
 from urllib.parse import urlsplit
 
 import cv2
@@ -18,7 +19,7 @@ import viser
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.evaluation.render import format_counts
-from slviewer.gui.panel import NO_SESSION, ButtonColour, ControlGroup, PanelContext, StepPanel
+from slviewer.gui.panel import NO_SESSION, ControlGroup, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.start import START, StartPanel
 from slviewer.gui.widgets import (
@@ -51,7 +52,11 @@ STEPS_PX, STEP_PX = 160, 340
 """Widths of the two panels: at 1280 px of page, the scene keeps 60 % of it."""
 
 _ICONS = {"done": "circle-check", "ready": "circle-dotted", "blocked": "lock"}
-_STEP_COLOURS: dict[str, ButtonColour] = {"done": "green", "ready": "gray", "blocked": "gray"}
+_STEP_COLOURS: dict[str, Literal["green", "gray"]] = {
+    "done": "green",
+    "ready": "gray",
+    "blocked": "gray",
+}
 """Of the icons, by `page_style.css`; the shown step's button has the accent colour."""
 _STEPS_WITH_RIG = ("rig", "target", "poses", "calibrate")  # in which the devices matter in 3D
 STAGES = {
@@ -139,8 +144,9 @@ class Shell(ControlGroup):
             self._progress = Text(gui)
             self._cancel = self.button("Cancel", operator.cancel, "player-stop", at_once=True)
             self._next = self.button(
-                "Continue", lambda: self.go(self._following_key), "arrow-right", None
+                "Continue", lambda: self.go(self._following_key), "arrow-right"
             )
+            self._next.color = None
             self._cancel.visible = self._next.visible = False
             self._panels[START] = StartPanel(self.context, self._leave_start)
             for key in (step.key for step in steps):
@@ -244,9 +250,10 @@ class Shell(ControlGroup):
         if following:
             self._following_key = following.key
             self._next.label = f"Continue to {following.title}"
-        self._next.visible = bool(
-            following and following.state != "blocked" and step.state == "done"
-        )
+        leads_on = bool(following and following.state != "blocked" and step.state == "done")
+        self._next.visible = leads_on
+        for button in self.context.main_buttons:
+            button.color = "gray" if leads_on else None
 
     def _draw_progress(self, snapshot: Snapshot) -> None:
         """Show the progress of capture and job, and whether it can be cancelled."""
@@ -439,8 +446,8 @@ def show_links(context: PanelContext, client: viser.ClientHandle | None) -> None
             " projector and camera too. This page continues."
         )
         gui.add_html(str(paragraph(about)))
-        renew = gui.add_button("New links", icon=viser.Icon.REFRESH, color="red")
-        close = gui.add_button("Close", color="gray")
+        renew = gui.add_button("New links", icon=viser.Icon.REFRESH, color="gray")
+        close = gui.add_button("Close")
     renew.on_click(replace)
     close.on_click(lambda _: dialog.close())
 

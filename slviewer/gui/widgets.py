@@ -421,7 +421,26 @@ _DETECTED, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
 
 
 class LiveImage(Picture):
-    """The live image in a panel, with what is to be seen in it."""
+    """The live image in a corner of the view, by `page_style.css`, with what is to be seen in it;
+    large where `is_large`, until a click changes it."""
+
+    is_large = False
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._marker = Text(gui)
+        super().__init__(gui)
+
+    def set(self, image: np.ndarray, legend: str = "") -> None:
+        """Show an image and its legend."""
+        self._marker.set(f'<div data-live="{"large" if self.is_large else "small"}"></div>')
+        ratio = image.shape[0] / image.shape[1]
+        below = f'<div data-live-legend style="--ratio:{ratio:.4f}">{legend}</div>'
+        super().set(image, below)
+
+    def hide(self) -> None:
+        """Hide image and legend."""
+        self._marker.set("")
+        super().hide()
 
     def draw(self, preview: PreviewView) -> None:
         """Show a frame and its exposure."""

@@ -2,7 +2,9 @@
 // dozens of them waiting; drawn one after the other, React takes them for an endless loop, throws (its error 185), and
 // the rest of that batch is lost. So batches that wait together are handed over as one.
 //
-// The theme follows the system: viser's server knows one for all browsers.
+// The theme follows the system: viser's server knows one for all browsers. Its buttons show no hints: they are kept for
+// `control_script.js`.
+const buttonHints = new Map();
 (() => {
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const onmessage = Object.getOwnPropertyDescriptor(Worker.prototype, "onmessage");
@@ -17,7 +19,8 @@
           const data = arrived[i++];
           if (data?.type === "message_batch")
             while (arrived[i]?.type === "message_batch") data.messages = data.messages.concat(arrived[i++].messages);
-          for (const message of data?.messages ?? [])
+          for (const message of data?.messages ?? []) {
+            if (message.props?.hint) buttonHints.set(message.uuid, message.props.hint);
             if (message.type === "ThemeConfigurationMessage") {
               message.dark_mode = dark.matches;
               dark.onchange = () => {
@@ -25,6 +28,7 @@
                 handler.call(this, { data: { type: "message_batch", messages } });
               };
             }
+          }
           try {
             handler.call(this, { data });
           } catch (error) {

@@ -41,7 +41,13 @@ Message = _messages.Message
 CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
 PAGE_SCRIPT = b"\n".join(
     resources.files("slviewer.server").joinpath(name).read_bytes()
-    for name in ("page_script.js", "pointer_script.js", "view_bar.js", "point_readout.js")
+    for name in (
+        "page_script.js",
+        "control_script.js",
+        "pointer_script.js",
+        "view_bar.js",
+        "point_readout.js",
+    )
 )
 """Our scripts, which run in viser's page before its own."""
 PAGE_STYLE = resources.files("slviewer.server").joinpath("page_style.css").read_bytes()

@@ -1,6 +1,7 @@
 """The frame of the page, as someone sees it who opens it: the step, a guest, the links, the help, a
 failure."""
 
+import re
 import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
@@ -102,6 +103,26 @@ def test_view_keeps_most_of_the_page_in_the_theme_of_the_system(opened: Opened) 
     wait_until(page, lambda: share_of_view() > 0.8)
     page.get_by_role("button", name="Expand").first.click()
     wait_until(page, lambda: share_of_view() < 0.7)
+
+
+def test_live_image_is_enlarged_by_click_and_by_key(opened: Opened) -> None:
+    page = opened.page
+    click(page, "1. Rig")
+    image = button(page, "Live image")
+    image.wait_for()
+
+    def width() -> float:
+        """Return the width of the live image, px."""
+        box = image.bounding_box()
+        assert box is not None
+        return box["width"]
+
+    assert width() < 0.3 * SIZE["width"]  # the rig is open: a thumbnail
+    image.click()
+    wait_until(page, lambda: width() > 0.3 * SIZE["width"])
+    image.press("Enter")
+    wait_until(page, lambda: width() < 0.3 * SIZE["width"])
+    expect(button(page, "Check rig")).to_have_attribute("title", re.compile("10 s"))
 
 
 def test_refused_rig_leaves_the_one_in_use(opened: Opened, app: App, tmp_path: Path) -> None:

@@ -68,7 +68,6 @@ class CalibratePanel(StepPanel):
         """Create the inputs, plots and tables."""
         gui, operator = self._gui, self._operator
         self._boards = self._scene.layer("calibrate/boards")
-        self._calibrate = self.button("Calibrate", operator.calibrate, "target", None)
         self._verdict = Text(gui)
         self._anyway = self.setting(
             self.checkbox("Accept anyway", "Uses this calibration although it was rejected"),
@@ -76,6 +75,7 @@ class CalibratePanel(StepPanel):
         )
         self._named = self.button_group("Show pose", "–", lambda name: self._pose.choose(name))
         self._summary = Text(gui)
+        self._calibrate = self.button("Calibrate", operator.calibrate, "target", None)
         with gui.add_folder("Models") as self._models_folder:
             self._choice_note = Text(gui)
             self._use = self.choice(
@@ -93,7 +93,7 @@ class CalibratePanel(StepPanel):
             self._bars = Plot(gui)
             self._pose = self.choice("Pose")
             self._pose_note = Text(gui)
-            self._exclude = self.button("Exclude this pose", self._toggle_pose, color="orange")
+            self._exclude = self.button("Exclude this pose", self._toggle_pose)
             self._device = self.dropdown("Residuals", DEVICES)
             self._arrows = Plot(gui)
         with gui.add_folder("Parameters", expand_by_default=False) as self._parameters_folder:

@@ -106,7 +106,7 @@ class ExportPanel(StepPanel):
         with gui.add_folder("Cloud or mesh"):
             self._source = self.choice("Source")
             self._finish = self.button(
-                "Write textured mesh", self._request_textured, "brush", None,
+                "Write textured mesh", self._request_textured, "brush",
                 hint="GLB with an image of the surface, 2048 px: for viewers and presentations",
             )  # fmt: skip
             self._as = self.dropdown("Type", (POINTS, MESH))
@@ -130,7 +130,6 @@ class ExportPanel(StepPanel):
                 "Write calibration",
                 lambda: operator.export(numbers.value, "", self._number_format.value),
                 "file-export",
-                None,
             )
         with gui.add_folder("Figures", expand_by_default=False) as self._figures_folder:
             self._figures = Text(gui)
@@ -148,7 +147,7 @@ class ExportPanel(StepPanel):
                 self._logo = self.button(
                     "Remove logo", lambda: operator.set_report_details(logo=""), "photo-off"
                 )
-            self._report = self.button("Write report", self._request_report, "report", None)
+            self._report = self.button("Write report", self._request_report, "report")
             self._table = self.button(
                 "Write figures",
                 lambda: operator.export("table"),

@@ -251,6 +251,7 @@ class MeasurePanel(StepPanel):
         gui, operator = self._gui, self._operator
         self._tool = Tool()
         self._related: dict[str, str] = {}
+        self._results = MeasurementList(self)
         with gui.add_folder("Surface") as self._surface_folder:
             self._surface = SurfaceView(self)
         with gui.add_folder("Tools") as self._tools_folder:
@@ -291,7 +292,6 @@ class MeasurePanel(StepPanel):
             self._end = self.button("End tool", end, "x", hint="Key: Esc")
         self._escape = gui.add_command("End the measuring tool", hotkey="escape", disabled=True)
         self.react(self._escape.on_trigger, end)
-        self._results = MeasurementList(self)
         self._inspection = InspectionInputs(self)
 
     def draw(self) -> None:

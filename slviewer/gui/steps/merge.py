@@ -59,6 +59,10 @@ class MergePanel(StepPanel):
         """Create the inputs of scans, alignment and view."""
         gui, operator = self._gui, self._operator
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
+        self._view = self.choice("3D view")
+        self._colour = self.choice("Colour")
+        self._legend = Text(gui)
+        self._result = Text(gui)
         with gui.add_folder("Scans") as self._scans_folder:
             self._none = Text(gui)
         with gui.add_folder("Alignment") as self._alignment_folder:
@@ -73,11 +77,7 @@ class MergePanel(StepPanel):
             self._picker = PointPicker(self)
             self._merge = self.button("Merge", self._request_merge, "layers-intersect", None)
             self._failure = Text(gui)
-        self._result = Text(gui)
-        self._undo = self.button("Undo merge", operator.undo_merge, "arrow-back-up", "orange")
-        self._view = self.choice("3D view")
-        self._colour = self.choice("Colour")
-        self._legend = Text(gui)
+        self._undo = self.button("Undo merge", operator.undo_merge, "arrow-back-up")
         self._editing = PointEditing(self, self._redraw)
 
     def draw(self) -> None:

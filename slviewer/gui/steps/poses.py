@@ -124,14 +124,16 @@ class PosesPanel(StepPanel):
         self._drawn_poses: dict[str, Any] = {}
         self._picture = LiveImage(gui)
         self._countdown = Text(gui)
+        self._accuracy = Text(gui)
+        self._coverage = Text(gui)
         self._other_object = Text(gui)
-        self._place = self.button(
-            "Place board", operator.place_at_suggestion, "target-arrow", "cyan",
-            hint="Moves the simulated board to the suggested pose",
-        )  # fmt: skip
         self._capture = self.button(
             "Capture pose", operator.capture_pose, "camera", None, hint="Key: C"
         )
+        self._place = self.button(
+            "Place board", operator.place_at_suggestion, "target-arrow",
+            hint="Moves the simulated board to the suggested pose",
+        )  # fmt: skip
         self._hotkey = gui.add_command(
             "Capture pose", hotkey="C", icon=viser.Icon.CAMERA, disabled=True
         )
@@ -140,7 +142,6 @@ class PosesPanel(StepPanel):
             self.checkbox("Hands-free", "Captures whenever the board is held still"),
             operator.set_hands_free,
         )
-        self._accuracy = Text(gui)
         self._wanted = self.setting(
             self.number(
                 "Sigma, mm",
@@ -155,7 +156,6 @@ class PosesPanel(StepPanel):
             ),
             lambda sigma: operator.set_wanted_sigma(float(sigma) or None),
         )
-        self._coverage = Text(gui)
         with gui.add_folder("Captured poses"):
             self._table = Text(gui)
             self._chosen = self.choice("Pose")
@@ -181,6 +181,7 @@ class PosesPanel(StepPanel):
                 self._T_board_centre[:3, 3] = self._board.outline().mean(axis=0)
             self._world = None
         self._capture.disabled = snapshot.rig.state != "open" or self._board is None
+        self._picture.is_large = not self.is_done
         self._place.visible = snapshot.world is not None
         self._place.disabled = session.suggestion is None or session.pending_plan is not None
         self._hands_free.update(snapshot.hands_free)

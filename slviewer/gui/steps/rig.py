@@ -54,7 +54,7 @@ class RigChoice(PanelPart):
         self._choice = self.dropdown("Rig", (_CHOOSE, *SIMULATED, _CUSTOM))
         self._chosen = self.setting(self._choice, self._request_choice)
         self._status = Text(gui)
-        self._retry = self.button("Try again", self._request_again, "refresh", None)
+        self._retry = self.button("Try again", self._request_again, "refresh")
         with gui.add_folder("Devices", visible=False) as self._devices:
             cameras = _label_drivers([d for d in available() if d.camera])
             self._camera = self.choice("Camera", options=cameras)
@@ -72,7 +72,6 @@ class RigChoice(PanelPart):
                 "Use these devices",
                 lambda: operator.choose_rig(self._read_entered()),
                 "plug-connected",
-                None,
             )
         self._pages = {role: Text(gui) for role in PAGE_ROLES}
         with gui.add_folder("Recording", visible=False) as self._recording:
@@ -83,7 +82,6 @@ class RigChoice(PanelPart):
                 "Play back",
                 lambda: operator.choose_rig({"driver": _REPLAY, "source": source.value}),
                 "player-play",
-                None,
             )
         with gui.add_folder("Save this rig", expand_by_default=False) as self._saving:
             name = gui.add_text(
@@ -287,7 +285,8 @@ class RigPanel(StepPanel):
         """Create the inputs of devices, exposure, light and check."""
         gui = self._gui
         RigChoice(self)
-        self._picture = LiveImage(gui, "Live image")
+        self._picture = LiveImage(gui)
+        RigCheck(self)
         self._histogram = Text(gui)
         self._exposure: Any = gui.add_slider("Exposure, ms", 0.01, 4.0, 0.01, 1.0)
         self.react(self._exposure.on_update, self._set_exposure)
@@ -296,11 +295,11 @@ class RigPanel(StepPanel):
             self.dropdown("Projector", LIGHTS, "Shown between captures"), self._set_light
         )
         ExposureInputs(self)
-        RigCheck(self)
 
     def draw(self) -> None:
         """Show the rig."""
         rig = self.snapshot.rig
+        self._picture.is_large = not self.is_done
         self._draw_exposure(rig)
         self._exposure.disabled = self._light.handle.disabled = rig.state != "open"
         if rig.light in _NAMES:
@@ -349,10 +348,10 @@ class RigCheck(PanelPart):
     def build(self) -> None:
         """Create the inputs and the list of results."""
         operator = self._operator
+        self._results = Text(self._gui)
         self._check = self.button(
             "Check rig", operator.check_rig, "stethoscope", None, hint="Takes about 10 s"
         )
-        self._results = Text(self._gui)
         self._recommended = self.button("Set exposure", self._set_exposure, "sun")
         self._linear = self.setting(
             self.checkbox("Linear light", "Corrects the grey levels by the table of the check"),

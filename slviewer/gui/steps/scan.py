@@ -42,8 +42,6 @@ from slviewer.simulation.concave import CONCAVE
 from slviewer.wizard.result_views import ScanCloud, used_points, whole_cloud
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView
 
-SMALL_PX = 380
-"""Width of the live image: the cloud matters more here."""
 ONE, ALIGNED = "one", "aligned"
 LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capture"
 _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibration"}
@@ -69,11 +67,49 @@ class ScanPanel(StepPanel):
         gui, operator = self._gui, self._operator
         self._screen = LiveScreen(self.context)
         operator.subscribe_live(self._screen.offer)
-        with gui.add_folder("Capture") as self._capture_folder:
-            self._picture = LiveImage(gui, "Live image", width_px=SMALL_PX)
-            self._capture = self.button(
-                "Capture scan", lambda: operator.capture_scan(label.value), "camera", None
+        self._picture = LiveImage(gui)
+        self._capture = self.button(
+            "Capture scan", lambda: operator.capture_scan(self._name.value), "camera", None
+        )
+        self._live = self.button("Live", self._toggle_live, "player-play", hint=LIVE_HINT)
+        self._save = self.button(
+            "Save cloud", lambda: operator.save_live(self._name.value), "download"
+        )
+        self._live_status = Text(gui)
+        self._gallery = Text(gui)
+        with gui.add_folder("Cloud") as self._cloud_folder:
+            self._scan = scan = self.choice("Scan")
+            self._figures = Text(gui)
+            self._colour = self.dropdown("Colour", SCAN_COLOURINGS)
+            self._legend = Text(gui)
+            self._view = self.choice("3D view")
+            self._model = self.choice("Model")
+            self._reconstruct = self.button(
+                "Reconstruct",
+                lambda: operator.reconstruct(scan.value, self._model.value or None),
+                "cube",
             )
+            self._placement = Text(gui)
+            self._place = self.button("Align scan", lambda: operator.align(scan.value), "puzzle")
+            self._take_out = self.button(
+                "Undo alignment", lambda: operator.undo_alignment(scan.value), "arrow-back-up"
+            )
+            self._support = self.button(
+                "Remove support", lambda: operator.remove_support(*self._shown_scans()),
+                "table-minus",
+                hint="Deletes the plane that the object stands on, and all below it; "
+                "Undo edit brings it back",
+            )  # fmt: skip
+            self._point = Text(gui)
+            self._region = RegionInputs(self)
+            self._editing = PointEditing(self, self._redraw, self._show_point)
+            name = gui.add_text("New name", "")
+            self.button("Rename scan", lambda: operator.rename(scan.value, name.value), "pencil")
+            self.button(
+                "Delete scan", lambda: operator.delete(scan.value), "trash",
+                hint="Moves it to the session's trash",
+            )  # fmt: skip
+        with gui.add_folder("Capture") as self._capture_folder:
             self._patterns = self.setting(
                 self.dropdown(
                     "Patterns",
@@ -89,51 +125,10 @@ class ScanPanel(StepPanel):
                 ),
                 operator.set_align_scans,
             )
-            label = gui.add_text("Name", "", hint="Optional; numbered by default")
-            self._live = self.button(
-                "Live", self._toggle_live, "player-play", "teal", hint=LIVE_HINT
-            )
-            self._save = self.button(
-                "Save cloud", lambda: operator.save_live(label.value), "download", "green"
-            )
-            self._live_status = Text(gui)
+            self._name = gui.add_text("Name", "", hint="Optional; numbered by default")
             TurnInputs(self)
             things = ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE)
             SimulatedObject(self, *things)
-        self._gallery = Text(gui)
-        with gui.add_folder("Cloud") as self._cloud_folder:
-            self._scan = scan = self.choice("Scan")
-            self._figures = Text(gui)
-            self._model = self.choice("Model")
-            self._reconstruct = self.button(
-                "Reconstruct",
-                lambda: operator.reconstruct(scan.value, self._model.value or None),
-                "cube",
-                None,
-            )
-            self._placement = Text(gui)
-            self._place = self.button("Align scan", lambda: operator.align(scan.value), "puzzle")
-            self._take_out = self.button(
-                "Undo alignment", lambda: operator.undo_alignment(scan.value), "arrow-back-up"
-            )
-            self._support = self.button(
-                "Remove support", lambda: operator.remove_support(*self._shown_scans()),
-                "table-minus",
-                hint="Deletes the plane that the object stands on, and all below it; "
-                "Undo edit brings it back",
-            )  # fmt: skip
-            self._view = self.choice("3D view")
-            self._colour = self.dropdown("Colour", SCAN_COLOURINGS)
-            self._legend = Text(gui)
-            self._point = Text(gui)
-            self._region = RegionInputs(self)
-            self._editing = PointEditing(self, self._redraw, self._show_point)
-            name = gui.add_text("New name", "")
-            self.button("Rename scan", lambda: operator.rename(scan.value, name.value), "pencil")
-            self.button(
-                "Delete scan", lambda: operator.delete(scan.value), "trash", "red",
-                hint="Moves it to the session's trash",
-            )  # fmt: skip
         self._restore = RestoreButton(self)
         ImportInputs(self, "scan")
 
@@ -142,8 +137,9 @@ class ScanPanel(StepPanel):
         snapshot, session, calibration = self.snapshot, self.session, self.session.calibration
         rig = snapshot.rig
         ready = rig.is_idle and not self.is_blocked
-        self._capture_folder.visible = rig.state != "none"
+        self._capture_folder.visible = self._capture.visible = rig.state != "none"
         self._capture.disabled = not ready
+        self._picture.is_large = not self.is_done
         self._draw_live(snapshot.live, ready)
         self._patterns.handle.disabled = not rig.is_idle
         if snapshot.session:
@@ -185,7 +181,7 @@ class ScanPanel(StepPanel):
     def _draw_live(self, live: LiveView | None, ready: bool) -> None:
         """Update buttons and figures of the live scan, during which a captured cloud is hidden."""
         button, save = self._live, self._save
-        button.label, button.color = ("Live", "teal") if live is None else ("Stop live", "red")
+        button.label = "Live" if live is None else "Stop live"
         button.icon = viser.IconName("player-play" if live is None else "player-stop")
         button.disabled = live is None and not ready
         save.visible, save.disabled = live is not None, live is None or not live.clouds_per_s

@@ -41,6 +41,8 @@ class TargetPanel(StepPanel):
         """Create the fields of the board, and the live image."""
         gui, board = self._gui, Board.parse(EXAMPLES["circles"])
         kinds = KINDS | {added.what: name for name, added in plugin_boards().items()}
+        self._picture = LiveImage(gui)
+        self._note = Text(gui)
         self._kind = self.choice("Board", options=kinds, do=self._fill_example)
         self._columns = self.number("Columns", board.columns, 2, 200, 1)
         self._rows = self.number("Rows", board.rows, 3, 200, 1)
@@ -49,7 +51,6 @@ class TargetPanel(StepPanel):
         self._pitch_y = self.number("Pitch y, mm", 0.0, 0.0, 1000.0, 0.01, differs)
         self._marker = self.number("Marker, mm", 1.0, 0.1, 1000.0, 0.01)
         self._dictionary = self.dropdown("Dictionary", DICTIONARIES)
-        self._note = Text(gui)
         self._use = self.button(
             "Use this board",
             lambda: self._operator.choose_target(str(self._parse_entered())),
@@ -58,11 +59,11 @@ class TargetPanel(StepPanel):
         )
         self.button("Create PDF", self._write_sheet, "printer", hint="To print the board to scale")
         self._sheet = Text(gui)
-        self._picture = LiveImage(gui, "Live image")
 
     def draw(self) -> None:
         """Show the session's board, describe the entered one, and whether it is the session's."""
         session = self.session
+        self._picture.is_large = not self.is_done
         if session.folder != self._folder:
             self._folder = session.folder
             self._sheet.set("")

@@ -14,8 +14,6 @@ from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import PreviewView, ScanView
 
 _ICONS: dict[Shape, str] = {"plane": "square", "sphere": "sphere"}
-SMALL_PX = 300
-"""Width of the live image: it only shows whether the plane or the sphere is in view."""
 TABLE = "figures.csv"
 MUCH_MASKED = 0.2
 """Share of a scan that is reported as a warning."""
@@ -30,8 +28,14 @@ class VerifyPanel(StepPanel):
         """Create the inputs of capture, results and recorded captures."""
         gui, operator = self._gui, self._operator
         self._waiting: dict[Shape, list[str]] = {}
+        with gui.add_folder("Result") as self._result_folder:
+            self._result = self.choice("Result")
+            self._figures = Text(gui)
+            self._model = self.choice("3D colours", "The model whose errors colour the cloud")
+            self._legend = Text(gui)
+            self._maps = Plot(gui)
         with gui.add_folder("Capture") as self._capture_folder:
-            self._picture = LiveImage(gui, "Live image", width_px=SMALL_PX)
+            self._picture = LiveImage(gui)
             self._captures = [
                 self.button(
                     "Capture plane",
@@ -43,7 +47,6 @@ class VerifyPanel(StepPanel):
                     "Capture sphere",
                     lambda: operator.capture_sphere(label.value, anyway=self._anyway.value),
                     "sphere",
-                    None,
                 ),
             ]
             self._anyway = self.checkbox(
@@ -52,12 +55,6 @@ class VerifyPanel(StepPanel):
             self._anyway.visible = False
             label = gui.add_text("Name", "", hint="Optional; numbered by default")
             SimulatedObject(self, *_ICONS)
-        with gui.add_folder("Result") as self._result_folder:
-            self._result = self.choice("Result")
-            self._figures = Text(gui)
-            self._maps = Plot(gui)
-            self._model = self.choice("3D colours", "The model whose errors colour the cloud")
-            self._legend = Text(gui)
         with gui.add_folder("All results") as self._table_folder:
             self._table = Text(gui)
             self.button("Write CSV", lambda: operator.export("table"), "table-export")
@@ -84,6 +81,7 @@ class VerifyPanel(StepPanel):
         """Show the verifications, and the chosen one."""
         session, rig, ready = self.session, self.snapshot.rig, not self.is_blocked
         self._capture_folder.visible = rig.state != "none"
+        self._picture.is_large = not self.is_done
         for button in self._captures:
             button.disabled = not (ready and rig.is_idle)
         rows = session.list_records(Verification)

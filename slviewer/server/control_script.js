@@ -1,0 +1,44 @@
+// What the controls of viser's page lack: hints of buttons, names for screen readers, folders that open by the keyboard,
+// and a live image in the view's corner that a click enlarges or shrinks.
+(() => {
+  const FOLDER = ".mantine-Paper-root[data-with-border] > .mantine-Paper-root:first-child";
+  const LIVE = "div:has(> [data-live]) + div img";
+  const name = (element, attributes) => {
+    for (const [key, value] of Object.entries(attributes))
+      if (element.getAttribute(key) !== String(value)) element.setAttribute(key, value);
+  };
+  const size = new ResizeObserver(([{ target }]) => {
+    const box = target.getBoundingClientRect();
+    document.documentElement.style.setProperty("--view-right", `${innerWidth - box.right}px`);
+    document.documentElement.style.setProperty("--view-width", `${box.width}px`);
+  });
+  let view = null;
+  const complete = () => {
+    const canvas = document.querySelector("canvas");
+    if (canvas && canvas !== view) size.observe((view = canvas));
+    for (const button of document.querySelectorAll("button[id]:not([title])"))
+      if (buttonHints.has(button.id)) button.title = buttonHints.get(button.id);
+    for (const label of document.querySelectorAll(FOLDER))
+      name(label, { role: "button", tabindex: 0, "aria-expanded": !label.querySelector(".tabler-icon-chevron-down") });
+    for (const image of document.querySelectorAll(LIVE))
+      name(image, { role: "button", tabindex: 0, "aria-label": "Live image", title: "Click to enlarge or shrink" });
+    for (const image of document.querySelectorAll("img:not([alt])")) image.alt = "";
+    for (const close of document.querySelectorAll(".mantine-Notification-closeButton"))
+      name(close, { "aria-label": "Dismiss" });
+  };
+  let waiting = 0;
+  new MutationObserver(() => (waiting ||= setTimeout(() => ((waiting = 0), complete()), 50))).observe(document, {
+    childList: true,
+    subtree: true,
+  });
+  document.addEventListener("click", ({ target }) => {
+    const marker = target.matches(LIVE) && target.closest("div:has(> [data-live]) + div").previousSibling.firstChild;
+    if (marker) marker.dataset.live = marker.dataset.live === "large" ? "small" : "large";
+  });
+  document.addEventListener("keydown", event => {
+    if ((event.key === "Enter" || event.key === " ") && event.target.matches(`${FOLDER}, ${LIVE}`)) {
+      event.preventDefault();
+      event.target.click();
+    }
+  });
+})();
