@@ -80,6 +80,8 @@ class PanelContext:
         self._toast = 0, 0.0  # rank of the latest one's level, and when it ends
         self.main_buttons: list[viser.GuiButtonHandle] = []
         """Of all steps; secondary while their step is done, as the next one follows."""
+        self.commands: list[viser.CommandHandle] = []
+        """Everything that keys do."""
 
     @property
     def session(self) -> Session:
@@ -376,6 +378,15 @@ class ControlGroup:
         self.react(handle.on_click, do, at_once=at_once)
         if color is None:
             self.context.main_buttons.append(handle)
+        return handle
+
+    def command(
+        self, label: str, do: Callable[[], Any], key: str, modifier: str | None = None
+    ) -> viser.CommandHandle:
+        """Add a key that calls `do()` while no text is being entered, and is listed behind "?"."""
+        handle = self._gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]
+        self.react(handle.on_trigger, do)
+        self.context.commands.append(handle)
         return handle
 
     def button_group(self, label: str, names: Sequence[str], do: Callable[[str], Any]) -> Any:

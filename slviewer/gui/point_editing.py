@@ -3,6 +3,7 @@ and the region of interest, a box that is moved and turned by a handle."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -122,7 +123,21 @@ class PointEditing(PanelPart):
                 "Redo edit", lambda: operator.redo_edit(*self._names), "arrow-forward-up"
             )
             self._list = Text(gui)
+        keys = {"rectangle": "R", "lasso": "L", BRUSH: "B", PART: "P", OFF: "escape"}
+        self._keys = [
+            self.command(f"Select points by: {mode}", partial(self._choose_mode, mode), key)
+            for mode, key in keys.items()
+        ]
+        self._keys.append(
+            self.command("Delete the selected points", self._delete_selected, "delete")
+        )
+        self._offer_keys()
         self._draw_status()
+
+    def _offer_keys(self) -> None:
+        """Let the keys act while points of the step can be edited."""
+        for key in self._keys:
+            key.disabled = not (self._visible and self._folder.visible)
 
     @property
     def _names(self) -> list[str]:
@@ -159,6 +174,7 @@ class PointEditing(PanelPart):
         """List the edits of scans, and offer to undo and redo them; without scans nothing is
         offered."""
         self._folder.visible = bool(scans)
+        self._offer_keys()
         self._undo.disabled = not any(scan.edits for scan in scans)
         self._redo.disabled = not any(scan.undone_edits for scan in scans)
         titles = ["" if len(scans) == 1 else f"{scan.label}, " for scan in scans]
@@ -173,6 +189,7 @@ class PointEditing(PanelPart):
         """Take clicks and drags in the 3D view, or leave them."""
         if visible != self._visible:  # otherwise they may be another step's
             self._visible = visible
+            self._offer_keys()
             self._listen()
 
     # what is selected
@@ -219,6 +236,11 @@ class PointEditing(PanelPart):
         self._show.visible = bool(hidden)
 
     # the 3D view
+
+    def _choose_mode(self, mode: str) -> None:
+        """Select by another way, as in the dropdown."""
+        self._mode.value = mode
+        self._change_mode()
 
     def _change_mode(self) -> None:
         """Take the clicks or drags that the way of selecting needs, then show its hint."""

@@ -22,6 +22,7 @@ from slviewer.evaluation.render import format_counts
 from slviewer.gui.panel import NO_SESSION, ControlGroup, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.start import START, StartPanel
+from slviewer.gui.undo_controls import UndoControls
 from slviewer.gui.widgets import (
     NOTICES,
     STEPS_PAGE,
@@ -128,6 +129,7 @@ class Shell(ControlGroup):
         )
         self._autopilot.visible = False
         self._counts = Text(gui)
+        self._undo = UndoControls(self.context)
         self._busy = Text(gui)
 
     def _build_right(self, steps: Sequence[StepView]) -> None:
@@ -186,6 +188,7 @@ class Shell(ControlGroup):
         self._draw_heading(snapshot)
         self._draw_progress(snapshot)
         self._draw_session(snapshot)
+        self._undo.update(snapshot)
         self._draw_devices(snapshot.calibration, snapshot.rig)
         self._panels[key].update(snapshot)
 

@@ -1,7 +1,7 @@
 """Setting the region of interest of a session, and deleting points of a scan so that they can be
 brought back."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from datetime import UTC, datetime
 
@@ -19,6 +19,7 @@ from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import (
     Edit,
+    EditHistory,
     Mask,
     SupportPlane,
     make_edit,
@@ -164,9 +165,9 @@ class Selection:
     plane: SupportPlane | None = None
 
 
-def delete_points(store: Session, selections: Sequence[Selection], what: str) -> dict[str, int]:
-    """Delete what is selected of one or several scans, in one step: {scan: points deleted}.
-    ``what``: how it was selected. Scans of which nothing is selected stay as they are.
+def delete_points(store: Session, selections: Sequence[Selection], what: str) -> dict[str, Edit]:
+    """Delete what is selected of one or several scans, in one step: {scan: its edit}. ``what``: how
+    it was selected. Scans of which nothing is selected stay as they are.
 
     InputError where nothing is selected at all, or nothing would remain of a scan.
     """
@@ -187,26 +188,41 @@ def delete_points(store: Session, selections: Sequence[Selection], what: str) ->
     with store.together():
         for scan, edit in edits.items():
             save_edits(store, scan, load_edits(store, scan).add(edit))
-    return {scan: edit.points for scan, edit in edits.items()}
+    return edits
 
 
-def step_history(store: Session, scans: Sequence[str], *, redo: bool = False) -> None:
+def step_history(store: Session, scans: Sequence[str], *, redo: bool = False) -> dict[str, str]:
     """Undo the last edit among those of several scans, of all scans that it was made of; or bring
-    back (``redo``) what was undone last. InputError where there is none."""
-    histories = {scan: load_edits(store, scan) for scan in scans}
+    back (``redo``) what was undone last. Returns {scan: when it was made}. InputError where there
+    is none."""
     made = {
-        scan: edit.made
-        for scan, history in histories.items()
-        for edit in (history.undone[:1] if redo else history.active[-1:])
+        scan: edit.made for scan in scans if (edit := _next_edit(load_edits(store, scan), redo))
     }
     if not made:
         raise InputError(f"no edit can be {'redone' if redo else 'undone'}: there is none")
     when = min(made.values()) if redo else max(made.values())
+    # of edits whose time is not known, the first one's alone
+    names = [scan for scan, time in made.items() if time == when][: None if when else 1]
+    stepped = dict.fromkeys(names, when)
+    step_edits(store, stepped, redo=redo)
+    return stepped
+
+
+def step_edits(store: Session, made: Mapping[str, str], *, redo: bool = False) -> None:
+    """Undo the last edit of each scan, or bring back (``redo``) the one that was undone last, in
+    one step. InputError where that is not the one that was made at the time {scan: time}."""
     with store.together():
-        # of edits whose time is not known, the first one's alone
-        for scan in [scan for scan, time in made.items() if time == when][: None if when else 1]:
-            history = histories[scan]
+        for scan, time in made.items():
+            history = load_edits(store, scan)
+            edit = _next_edit(history, redo)
+            if edit is None or edit.made != time:
+                raise InputError(f"the edits of {scan} have changed since")
             save_edits(store, scan, history.redo(1) if redo else history.undo(1))
+
+
+def _next_edit(history: EditHistory, redo: bool) -> Edit | None:
+    """Return the edit that is undone next, or brought back next; None where there is none."""
+    return next(iter(history.undone[:1] if redo else history.active[-1:]), None)
 
 
 def set_region(

@@ -87,6 +87,21 @@ class Decisions:
         hold."""
         self._decide(what, lambda: value)
 
+    def replace_decision(self, what: str, old: Any, new: Any) -> None:
+        """Change a decision from one value to another: of a table only the entries that differ
+        between them."""
+
+        def make() -> Any:
+            """Return the new value."""
+            if not isinstance(old if new is None else new, dict):
+                return new
+            before, after, now = (each or {} for each in (old, new, self.decision(what)))
+            changed = {key for key in {*before, *after} if before.get(key) != after.get(key)}
+            kept = {key: value for key, value in now.items() if key not in changed}
+            return {**kept, **{key: after[key] for key in changed & after.keys()}} or None
+
+        self._decide(what, make)
+
     def decision(self, what: str) -> Any:
         """What was decided last; None where nothing was. Raises DamagedError where it cannot be
         read."""

@@ -7,6 +7,7 @@ threads do the work.
 `*_requests`          the requests, grouped by topic: methods of the state, which turn what they
                       raise into notices
 `engine`              the state behind them, and what a new snapshot requires
+`undo_history`        what was done last and can be undone, and the steps that take it back
 `service`             what the threads of the following have in common, and their timing
 `acquisition`         one thread that owns camera and projector, and never computes
 `preview_watcher`     analyses the latest preview frame: board, brightness, stillness

@@ -46,6 +46,7 @@ from slviewer.wizard.snapshot import (
     WorldView,
 )
 from slviewer.wizard.steps import views
+from slviewer.wizard.undo_history import Step, UndoHistory
 
 READ_ATTEMPTS = 20
 """Snapshots in a row that may meet the session's files in the middle of a change."""
@@ -104,6 +105,7 @@ class Engine:
         self._live: LiveScan | None = None  # the last one, whether it runs or not
         self._live_listeners = Listeners[LiveCloud]()
         self._hands_free = HandsFree(timing)
+        self._history = UndoHistory()
         self._bench: RigSetup | None = None
         self._choice: Choice | None = None
         self._session_reader: SessionReader | None = None
@@ -189,10 +191,12 @@ class Engine:
         work: Callable[[Job], Findings[Any] | str],
         section: str = "",
         failed: Callable[[BaseException], None] | None = None,
+        finish: Callable[[Findings[Any]], None] | None = None,
     ) -> None:
         """Queue work on the session, which no longer saves once it was cancelled; what it returns
-        becomes a notice, and `failed(error)` replaces that of a failure. ``section``: of the help,
-        of the notices. Warnings that the result states are not repeated."""
+        becomes a notice, and `failed(error)` replaces that of a failure. `finish(found)` is called
+        with what it found. ``section``: of the help, of the notices. Warnings that the result
+        states are not repeated."""
         store, warnings = self._store, list[str]()
 
         def add_warnings(stated: str = "") -> None:
@@ -203,6 +207,8 @@ class Engine:
 
         def done(found: Findings[Any] | str) -> None:
             """Add what the work found to the notices."""
+            if finish is not None and not isinstance(found, str):
+                finish(found)
             text = found if isinstance(found, str) else found.summary()
             is_good = isinstance(found, str) or all(each.is_good for each in found.values())
             add_warnings(text)
@@ -233,6 +239,7 @@ class Engine:
         settings: Any,
         section: str = "",
         failed: Callable[[BaseException], None] | None = None,
+        finish: Callable[[Findings[Any]], None] | None = None,
     ) -> None:
         """Queue an operation as `_work`. A calibration that the operator uses although it was
         rejected is used."""
@@ -244,7 +251,14 @@ class Engine:
                 used = replace(settings, accept_rejected=True)
             return operation.run(job.store, used, job.progress, job.warn)
 
-        self._work(title, work, section, failed)
+        self._work(title, work, section, failed, finish)
+
+    def _add_change(self, store: Session, name: str, reverse: Step) -> None:
+        """Add a change of a session to what can be undone, as long as that session is open."""
+        with self._lock:
+            if store is self.session:
+                self._history.add(name, reverse)
+        self._publisher.mark_changed()
 
     # the background
 
@@ -253,8 +267,11 @@ class Engine:
         reader = self._session_reader
         if reader is None:
             return
-        target = reader.target()
-        for capture in reader.session.captures():
+        target, captures = reader.target(), reader.session.captures()
+        there = {capture.name for capture in captures}
+        with self._lock:  # a deleted capture that is restored is processed again
+            self._queued = {key for key in self._queued if key[0] in there}
+        for capture in captures:
             key = (capture.name, capture.hash, target)
             with self._lock:
                 if key in self._queued or capture.is_imported_cloud:
@@ -352,6 +369,8 @@ class Engine:
             hands_free=self._hands_free.is_on,
             live=live.figures() if live and live.is_running else None,
             read_failure=read_failure,
+            next_undo=self._history.next_undo,
+            next_redo=self._history.next_redo,
         )
         return replace(now, steps=views(now))
 

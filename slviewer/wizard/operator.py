@@ -279,8 +279,10 @@ class Operator(RigRequests, ResultRequests):
         check_space(self._store, self._require_bench().rig.camera, frames, name)
 
     def _next_name(self, kind: str) -> str:
-        """Return the next unused name, such as pose_07, counting saved and queued captures."""
-        used = [*self._store.taken_names(), *self._acquisition.names()]
+        """Return the next unused name, such as pose_07, counting saved, queued and deleted
+        captures: those in the trash can come back."""
+        deleted = [each.name for each in self._store.trashed() if each.is_capture]
+        used = [*self._store.taken_names(), *self._acquisition.names(), *deleted]
         numbers = [name.removeprefix(f"{kind}_") for name in used]
         number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
         return f"{kind}_{number:02d}"

@@ -16,7 +16,6 @@ from slviewer.inspection.regions import Region
 from slviewer.pipeline.accept import ValidateSettings, validate
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.compare import CompareSettings, compare
-from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, step_history
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
 from slviewer.pipeline.feedback import part
 from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
@@ -26,21 +25,16 @@ from slviewer.pipeline.measure import (
     export_measurements,
     measure,
     relate,
-    rename_measurement,
-    restore_measurement,
-    trash_measurement,
 )
 from slviewer.pipeline.measure import What as Tool
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.pipeline.merge import (
-    PLACEMENTS,
     AlignSettings,
     MergeSettings,
     Picked,
     StartKind,
     align,
     merge,
-    remove_placement,
 )
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.models import (
@@ -61,18 +55,16 @@ from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
-from slviewer.session.names import clean_label, plain_name, safe_name
+from slviewer.session.names import plain_name, safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
 from slviewer.session.report_details import encode_logo
-from slviewer.session.scan_edits import load_edits, load_region, save_region
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
-from slviewer.surface.region_of_interest import RegionOfInterest
-from slviewer.surface.selection import select_support
+from slviewer.wizard.change_requests import ChangeRequests
 from slviewer.wizard.diagnostics import write_bundle
-from slviewer.wizard.engine import Engine, on_session, request
+from slviewer.wizard.engine import on_session, request
 from slviewer.wizard.notices import describe_failure
-from slviewer.wizard.result_views import load_scan_cloud, surface_to_measure, whole_cloud
+from slviewer.wizard.result_views import surface_to_measure
 from slviewer.wizard.session_reader import missing_for_splined
 
 TABLE, PLAN = "measurements.csv", Path(OWN_PLAN).name
@@ -84,42 +76,9 @@ _ALTERNATIVES = {
 """What else to try where scans cannot be aligned from a start, other than from those starts."""
 
 
-class ResultRequests(Engine):
+class ResultRequests(ChangeRequests):
     """Requests that compute results from captures, decisions about poses, scans and models, and
     measurements on a scan or a merge."""
-
-    exclude = on_session("Excluding the pose", Session.exclude)
-    include = on_session("Including the pose", Session.include)
-
-    @request("Deleting")
-    def delete(self, name: str) -> None:
-        """Move a capture, and its own results, to the session's trash."""
-        store = self._store
-        store.trash_capture(name)
-        store.include(name)
-        for kind in ("poses", "clouds", "verify", "trust", PLACEMENTS):
-            if store.has_result(f"{kind}/{name}"):
-                store.trash_result(f"{kind}/{name}")
-
-    @request("Restoring")
-    def undelete(self, name: str) -> None:
-        """Restore a deleted capture from the trash; its results are computed again."""
-        self._store.restore_last(name)
-        restored = self._store.load_capture(name)
-        with self._lock:
-            self._queued = {key for key in self._queued if key[1] != restored.hash}
-        self._queue_processing()
-
-    @request("Renaming")
-    def rename(self, name: str, label: str) -> None:
-        """Set the label of a capture, any text; its files keep their name."""
-        self._store.load_capture(name)
-        self._set_label(name, label)
-
-    def _set_label(self, name: str, label: str) -> None:
-        """Store the operator's label of a capture; its name where that is blank."""
-        labels = self._store.decision("names") or {}
-        self._store.decide("names", {**labels, name: clean_label(label) or name})
 
     @request("Calibrating")
     def calibrate(self) -> None:
@@ -144,15 +103,6 @@ class ResultRequests(Engine):
         """Cross-validate the models on the target poses; the best one is then recommended, and
         used."""
         self._run("Comparing the models", validate, ValidateSettings(), "calibration")
-
-    @request("Choosing the model")
-    def choose_model(self, name: str) -> None:
-        """Set the model that later steps use; empty: the recommended one."""
-        if name and name not in (models := available_models(self._store)):
-            raise InputError(
-                f"the session has no {name} calibration: choose one of {', '.join(models)}"
-            )
-        self._store.decide("model", name or None)
 
     accept_rejected_calibration = on_session(
         "Using the rejected calibration", accept_rejected_calibration
@@ -193,8 +143,6 @@ class ResultRequests(Engine):
         """Return names of captures. Raises InputError for one that does not exist."""
         return [self._store.load_capture(name).name for name in names]
 
-    undo_alignment = on_session("Undoing the alignment", remove_placement)
-
     @request("Switching the alignment of scans")
     def set_align_scans(self, on: bool) -> None:
         """Align each new scan to those before it as soon as it is reconstructed; those that are
@@ -217,7 +165,7 @@ class ResultRequests(Engine):
     ) -> None:
         """Register scans, in the order in which they were captured, to a reference, and merge them.
 
-        `undo_merge` undoes it; the snapshot shows why a merge failed until the next one. `start`,
+        The snapshot shows why a merge failed until the next one. `start`,
         `angle` and `picked` as in `pipeline.merge`.
         """
         chosen = self._check_names(names)
@@ -227,7 +175,7 @@ class ResultRequests(Engine):
         except SlviewerError as error:
             failed(error)
             return
-        self._run(MERGING, merge, settings, "merge", failed)
+        self._run(MERGING, merge, settings, "merge", failed, self._finish("merge"))
 
     def _merge_turn(self, names: list[str]) -> None:
         """Queue the merge of the scans of a turn by the angles of its turntable, and a watertight
@@ -238,6 +186,7 @@ class ResultRequests(Engine):
             settings = MergeSettings(names, names[0], accept_rejected=accepts_rejected(job.store))
             merging, meshing = part(job.progress, 0, 0.7), part(job.progress, 0.7, 1)
             found = merge_turn(job.store, settings, merging, job.warn)
+            finish(found)
             ((number, merged),) = found.items()
             try:
                 words = _export_file(
@@ -255,6 +204,7 @@ class ResultRequests(Engine):
                 f" {words}"
             )
 
+        finish = self._finish("merge")
         self._work(MERGING, work, "merge", self._begin_merge("turntable"))
 
     def _begin_merge(self, start: str) -> Callable[[BaseException], None]:
@@ -276,95 +226,6 @@ class ResultRequests(Engine):
             self._notices.add("error", text, f"merge-{reason}" if reason else "merge")
 
         return failed
-
-    def _last_merge(self, missing: str) -> str:
-        """Return the number of the current merge. Raises InputError with ``missing`` without
-        one."""
-        merge = self._publisher.refresh().content.merge
-        if merge is None:
-            raise InputError(missing)
-        return merge.name
-
-    @request("Undoing the merge")
-    def undo_merge(self) -> None:
-        """Move the current merge to the trash; the previous one is current again."""
-        number = self._last_merge("there is no merge to undo")
-        self._store.trash_result(f"merge/{number}")
-        (self._store.exports / f"merged_{number}.ply").unlink(missing_ok=True)
-
-    # which points of scans are used
-
-    set_region = on_session("Setting the region", save_region)
-
-    @request("Switching the region")
-    def switch_region(self, on: bool) -> None:
-        """Put the last region of interest into effect, or use all points."""
-        region = load_region(self._store, even_if_off=True)
-        if region is None:
-            raise InputError("there is no region yet: take the automatic one of a scan")
-        save_region(self._store, region, on)
-
-    @request("Setting the region")
-    def fit_region(self, scan: str) -> None:
-        """Make the box around all points of a reconstructed scan the region of interest."""
-        save_region(self._store, RegionOfInterest.around(whole_cloud(self._store, scan).points))
-
-    @request("Deleting points")
-    def delete_points(self, selections: Sequence[Selection], what: str) -> None:
-        """Delete what is selected of the points that are shown of one or several scans; `undo_edit`
-        undoes it."""
-        counts = delete_points(self._store, selections, what)
-        self._notices.add(
-            "info",
-            f"{', '.join(counts)}: {sum(counts.values()):,} points deleted; Undo edit brings them"
-            " back",
-        )
-
-    @request("Removing the support")
-    def remove_support(self, *scans: str) -> None:
-        """Delete the plane that the object stands on, and all below it, from scans; `undo_edit`
-        undoes it for each.
-
-        Scans without such a plane, and those that it was deleted from before, stay as they are,
-        with a warning; where all of them do, it fails.
-        """
-
-        def work(job: Job) -> str:
-            """Delete the supports; returns a sentence about them."""
-            store, selections, refused = job.store, list[Selection](), list[str]()
-            for i, name in enumerate(scans):
-                job.progress(i / len(scans), f"removing the support from {name}")
-                if any(edit.plane is not None for edit in load_edits(store, name).active):
-                    refused.append(
-                        f"{name}: its support was removed before; Undo edit brings it back"
-                    )
-                    continue
-                try:
-                    cloud = load_scan_cloud(store, name)
-                    plane, selected = select_support(cloud.points, cloud.sigma_z)
-                    selections.append(Selection(name, cloud.points, selected, plane))
-                except InputError as error:
-                    refused.append(f"{name}: {error}")
-            if not selections:
-                raise InputError("; ".join(refused) or "no scan is reconstructed yet")
-            deleted = delete_points(store, selections, SUPPORT)
-            for reason in refused:
-                job.warn(reason)
-            job.progress(1.0, "support removed")
-            counts = ", ".join(f"{name} {count:,} points" for name, count in deleted.items())
-            return f"support removed: {counts}; Undo edit brings it back"
-
-        self._work("Removing the support", work, "scans")
-
-    @request("Undoing the edit")
-    def undo_edit(self, *scans: str) -> None:
-        """Undo the last edit of scans, of all those that it was made of."""
-        step_history(self._store, scans)
-
-    @request("Redoing the edit")
-    def redo_edit(self, *scans: str) -> None:
-        """Bring the last edit of scans that was undone back."""
-        step_history(self._store, scans, redo=True)
 
     # files
 
@@ -446,12 +307,13 @@ class ResultRequests(Engine):
         )
         chosen["at"] = [int(number) for number in np.ravel(at)] if len(at) else ()
         settings = MeasureSettings(on, what, **chosen, load=partial(surface_to_measure, name=on))
-        self._run(MEASURING, measure, settings, "measurements")
+        self._run(MEASURING, measure, settings, "measurements", finish=self._finish("measure"))
 
     @request(MEASURING)
     def measure_between(self, a: str, b: str) -> None:
         """Measure angles and distances between two points or fits, by their ids."""
-        self._run(MEASURING, relate, RelateSettings(a, b), "measurements")
+        finish = self._finish("measure")
+        self._run(MEASURING, relate, RelateSettings(a, b), "measurements", finish=finish)
 
     @request("Reading the nominal model")
     def upload_nominal(self, name: str, content: bytes) -> None:
@@ -527,11 +389,7 @@ class ResultRequests(Engine):
             """Report why, in the words of the panel."""
             self._notices.add_failure(COMPARING, _reword(error))
 
-        self._run(COMPARING, compare, settings, "measurements", failed)
-
-    relabel_measurement = on_session("Renaming", rename_measurement)
-    delete_measurement = on_session("Deleting", trash_measurement)
-    undo_delete = on_session("Restoring", restore_measurement)
+        self._run(COMPARING, compare, settings, "measurements", failed, self._finish("compare"))
 
     @request("Writing the table")
     def export_measurements_table(self) -> None:

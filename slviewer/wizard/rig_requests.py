@@ -73,6 +73,7 @@ class RigRequests(Engine):
             self._acquisition.stop_stream()
             self._jobs.cancel_all()
             self._session_reader, self._queued = SessionReader(store, self._planner), set()
+            self._history.clear()
             self.show(merge_failure="")
             if before:
                 before.close()

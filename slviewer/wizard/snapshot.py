@@ -357,6 +357,8 @@ class Snapshot:
         None  # share of the kernels compiled in the background; None while none are
     )
     brightness: Brightness = ""  # of the camera's image in white light
+    next_undo: str = ""  # what was done last and can be undone; empty where nothing can
+    next_redo: str = ""  # what was undone last
 
     @property
     def is_busy(self) -> bool:

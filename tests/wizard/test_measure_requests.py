@@ -100,6 +100,8 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     left, right, width, cut, point = now(operator).measurements
     assert operator.measure_between(left.name, right.name)
     apart = now(operator).measurements[-1]
+    assert operator.undo() and len(now(operator).measurements) == 5
+    assert operator.redo() and now(operator).measurements[-1] == apart
     radius, true = left.record["radius"], float(np.linalg.norm(CENTRES[1] - CENTRES[0]))
     assert abs(radius.value - RADIUS) < max(3 * (radius.sigma or 0), 0.05)
     assert apart.record.quantities[0].value == pytest.approx(true, abs=0.1)
@@ -114,7 +116,12 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     assert [each.stale for each in session.measurements if each.name == apart.name] == [True]
     assert session.deleted_measurements == 1
     assert missing_facts(operator.snapshot().step("measure").problems[0], apart.label) == []
-    assert operator.undo_delete() and not any(each.stale for each in now(operator).measurements)
+    assert operator.undo() and now(operator).deleted_measurements == 0
+    assert (
+        operator.redo()
+        and operator.undo_delete()
+        and not any(each.stale for each in now(operator).measurements)
+    )
     assert operator.export_measurements_table()
     made = next(each for each in now(operator).exports if each.name == "measurements.csv")
     rows = list(csv.DictReader(made.path.read_text("utf-8-sig").splitlines()))

@@ -156,6 +156,12 @@ def test_picked_pairs_start_a_merge(operator: Operator) -> None:
         not missing_facts(notice.text, "third", "first", "picked points")
         for notice in snapshot.notices
     )
+    ply = operator.session.exports / f"merged_{merge.name}.ply"
+    content = ply.read_bytes()
+    assert snapshot.next_undo == f"merge: {merge.name}" and operator.undo()
+    assert settled(operator)[1] is None and not ply.exists()
+    assert operator.redo() and name_of(settled(operator)[1]) == merge.name
+    assert ply.read_bytes() == content
     line = np.outer([0, 1, 2], [10.0, 0, 0]) + MIDDLE
     assert operator.merge(["first", "third"], "first", picked={("third", "first"): (line, line)})
     assert missing_facts(settled(operator)[0].merge_failure, "one line") == []

@@ -290,8 +290,8 @@ class MeasurePanel(StepPanel):
                 )
             end = partial(self._select_tool, "")
             self._end = self.button("End tool", end, "x", hint="Key: Esc")
-        self._escape = gui.add_command("End the measuring tool", hotkey="escape", disabled=True)
-        self.react(self._escape.on_trigger, end)
+        self._escape = self.command("End the measuring tool", end, "escape")
+        self._escape.disabled = True
         self._inspection = InspectionInputs(self)
 
     def draw(self) -> None:

@@ -1,0 +1,182 @@
+"""What was done last is undone and redone, whatever it was, by name; nothing else changes, and
+nothing is lost."""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from facts import missing_facts
+from wizard_events import HANG_S
+
+from slviewer.errors import InputError, SessionError
+from slviewer.fringe.presets import phase_steps
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.edit import Selection
+from slviewer.session.scan_edits import list_edits, load_edits
+from slviewer.session.store import Session
+from slviewer.surface.region_of_interest import RegionOfInterest
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.undo_history import Step, UndoHistory
+
+SEQUENCE = PatternSequence((16, 12), tuple(phase_steps("x", 4, 8.0)))
+
+
+def add_capture(store: Session, name: str, seed: int) -> None:
+    """Save a scan of noise."""
+    frames = np.random.default_rng(seed).integers(0, 255, (4, 6, 8), np.uint8)
+    store.save_capture(name, "scan", SEQUENCE, frames, source="")
+
+
+@pytest.fixture
+def operator(tmp_path: Path) -> Iterator[Operator]:
+    """A session with three captures of noise, without a rig."""
+    with Session.create(tmp_path / "session") as store:
+        for i in (1, 2, 3):
+            add_capture(store, f"scan_{i:02d}", i)
+    with Operator(tmp_path / "session") as engine:
+        engine.wait_until_idle(HANG_S)
+        yield engine
+
+
+def opened(operator: Operator) -> Session:
+    assert operator.session is not None
+    return operator.session
+
+
+def state(operator: Operator) -> dict[str, Any]:
+    """What the session holds, apart from its trash and from what is computed again."""
+    store = opened(operator)
+    decisions = {what: store.decision(what) or {} for what in ("names", "excluded", "region")}
+    hashes = {capture.name: capture.hash for capture in store.captures()}
+    clouds = [name for name in store.result_names() if name.startswith("clouds/")]
+    edits = {name: list_edits(store, name)[0] for name in hashes}
+    return {"decisions": decisions, "captures": hashes, "clouds": clouds, "edits": edits}
+
+
+def names(operator: Operator) -> tuple[str, str]:
+    now = operator.wait_until_idle(HANG_S)
+    return now.next_undo, now.next_redo
+
+
+def test_a_history_moves_changes_between_undone_and_done() -> None:
+    history, values = UndoHistory(), ["a"]
+
+    def assign(value: str) -> Step:
+        before, values[0] = values[0], value
+        return partial(assign, before)
+
+    for value in ("b", "c"):
+        history.add(f"set {value}", assign(value))
+    assert history.undo() == "set c" and values == ["b"] and history.next_redo == "set c"
+    assert history.redo() == "set c" and values == ["c"]
+    assert [history.undo(), history.undo()] == ["set c", "set b"] and values == ["a"]
+    with pytest.raises(InputError):
+        history.undo()
+    assert history.redo() == "set b"
+    history.add("set d", assign("d"))
+    assert (history.next_undo, history.next_redo) == ("set d", "")
+    assert [history.undo(), history.undo()] == ["set d", "set b"] and values == ["a"]
+    history.clear()
+    assert (history.next_undo, history.next_redo) == ("", "")
+
+
+def test_a_change_that_cannot_be_undone_is_forgotten_one_that_failed_stays() -> None:
+    history, errors = UndoHistory(), [SessionError("the disk is full"), InputError("it is gone")]
+
+    def fail() -> Step:
+        raise errors.pop(0)
+
+    history.add("first", lambda: fail)
+    history.add("second", fail)
+    with pytest.raises(SessionError):
+        history.undo()
+    assert history.next_undo == "second"
+    with pytest.raises(InputError, match="second"):
+        history.undo()
+    assert history.undo() == "first"
+
+
+def test_every_change_is_undone_and_redone_by_name(operator: Operator) -> None:
+    store = opened(operator)
+    points = np.random.default_rng(0).normal(500, 1, (6, 8, 3)).astype(np.float32)
+    for name in ("scan_01", "scan_02"):
+        store.save_result(f"clouds/{name}", {"inputs": {}}, {})
+    selected = [
+        Selection(name, points, np.arange(48).reshape(6, 8) < 7) for name in ("scan_01", "scan_02")
+    ]
+    region = RegionOfInterest((0.0, 0.0, 500.0), (10.0, 10.0, 10.0))
+    changes = {
+        "rename scan_02": partial(operator.rename, "scan_02", "Part <B>"),
+        "exclude Part <B>": partial(operator.exclude, "scan_02", "blurred"),
+        "delete 14 points": partial(operator.delete_points, selected, "lasso"),
+        "set the region": partial(operator.set_region, region),
+        "switch the region off": partial(operator.switch_region, False),
+        "delete Part <B>": partial(operator.delete, "scan_02"),
+        "include scan_01": partial(operator.include, "scan_01"),
+        "undo the edit of scan_01": partial(operator.undo_edit, "scan_01"),
+    }
+    states = [state(operator)]
+    for name, change in changes.items():
+        assert change(), [notice.text for notice in operator.notices()]
+        states.append(state(operator))
+        assert names(operator) == (name, "")
+    for name, before in zip(reversed(changes), states[-2::-1], strict=True):
+        assert operator.snapshot().next_undo == name
+        assert operator.undo() and state(operator) == before, name
+        assert names(operator)[1] == name
+    assert not operator.undo()
+    for name, after in zip(changes, states[1:], strict=True):
+        assert operator.redo() and state(operator) == after, name
+    assert not operator.redo()
+    assert operator.undo() and load_edits(store, "scan_01").applied == 1
+
+
+def test_a_deleted_capture_comes_back_although_another_took_its_name(operator: Operator) -> None:
+    store = opened(operator)
+    store.save_result("clouds/scan_03", {"inputs": {}}, {})
+    before = state(operator)
+    assert operator.delete("scan_03")
+    assert operator._next_name("scan") == "scan_04"  # that of a deleted one is not used again
+    add_capture(store, "scan_03", 9)
+    other = store.load_capture("scan_03").hash
+    assert operator.undo() and state(operator) == before
+    assert store.deleted_captures() == []  # the name is in use, but the other is in the trash
+    (trashed,) = (each for each in store.trashed() if each.is_capture)
+    assert trashed.name == "scan_03"
+    store.restore([trashed])
+    assert store.load_capture("scan_03").hash == other
+
+
+def test_labels_given_meanwhile_stay(operator: Operator) -> None:
+    assert operator.rename("scan_01", "first")
+    store = opened(operator)
+    store.decide("names", {**store.decision("names"), "scan_02": "second"})
+    assert operator.undo() and store.decision("names") == {"scan_02": "second"}
+    assert operator.redo() and store.decision("names") == {"scan_01": "first", "scan_02": "second"}
+
+
+def test_edits_that_changed_since_are_left_alone(operator: Operator) -> None:
+    store = opened(operator)
+    points = np.full((6, 8, 3), 500, np.float32)
+    for i in range(2):
+        selected = Selection("scan_01", points, np.arange(48).reshape(6, 8) == i)
+        assert operator.delete_points([selected], "lasso")
+        if not i:
+            assert operator.undo_edit("scan_01")
+    # what was undone by hand is forgotten once there is a new edit
+    assert operator.undo() and load_edits(store, "scan_01").applied == 0
+    before = load_edits(store, "scan_01").edits[0].made
+    assert not operator.undo()
+    assert missing_facts(operator.notices()[-1].text, "scan_01") == []
+    assert load_edits(store, "scan_01").edits[0].made == before
+
+
+def test_another_session_begins_without_a_history(operator: Operator, tmp_path: Path) -> None:
+    assert operator.exclude("scan_01") and names(operator)[0]
+    folder = opened(operator).folder
+    assert operator.open_session(tmp_path / "other") and names(operator) == ("", "")
+    assert operator.open_session(folder) and names(operator) == ("", "")
+    assert not operator.undo() and "scan_01" in opened(operator).excluded()
