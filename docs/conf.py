@@ -106,26 +106,72 @@ def list_options() -> str:
     return "\n".join(lines)
 
 
-def list_functions() -> str:
-    """Return the page of the Python interface: every public name of slviewer with its docstring."""
-    lines = ["# Python", "", "```{eval-rst}", ".. automodule:: slviewer", ""]
-    for name in slviewer.__all__:
-        public = getattr(slviewer, name)
-        if inspect.ismodule(public):
-            # once is enough for what slviewer exports itself
-            again = ", ".join(sorted(set(slviewer.__all__) & set(getattr(public, "__all__", ()))))
-            lines += [
-                f".. automodule:: {public.__name__}",
-                "   :members:",
-                f"   :exclude-members: {again}",
-                "",
-            ]
-            continue
-        lines += [
-            f".. {'autoclass' if isinstance(public, type) else 'autofunction'}:: slviewer.{name}",
-            "",
-        ]
-    return "\n".join([*lines, "```", ""])
+TOPICS: dict[str, tuple[str, str]] = {
+    "python-sessions": (
+        "Sessions",
+        "Session import_captures import_cloud calibrate reconstruct verify align merge mesh measure"
+        " compare run_plan check accept capture batch report export simulate load_calibration"
+        " load_arrays CalibrationResult Measurement Quantity Verification",
+    ),
+    "python-patterns": (
+        "Patterns and decoding",
+        "Frame PatternSequence one_axis complementary gray micro multifrequency p18 read_captures"
+        " decode PhaseMap Reason texture examine",
+    ),
+    "python-calibration": (
+        "Boards and calibration",
+        "Board detect_board calibrate_frames save_calibration evaluate_plane evaluate_sphere"
+        " draw_error_maps",
+    ),
+    "python-clouds": (
+        "Clouds and meshes",
+        "Cloud reconstruct_cloud align_clouds fuse_clouds mesh_cloud MeshingPlan show read_ply"
+        " write_ply",
+    ),
+    "python-simulation": (
+        "Simulated and own devices",
+        "SimulatedWorld simulated_rig letter_rig Pose capture_frames datasets plugins"
+        " SlviewerError",
+    ),
+}
+"""The pages of the Python interface: title, and the public names in the order of their use."""
+
+
+def list_functions() -> dict[str, str]:
+    """Return the pages of the Python interface by name: one that lists all names with what they do,
+    and one a topic with their docstrings. Raises ValueError for a name without a topic."""
+    names = [name for _, listed in TOPICS.values() for name in listed.split()]
+    if sorted(names) != sorted(slviewer.__all__):
+        raise ValueError(f"TOPICS of docs/conf.py: {set(names) ^ set(slviewer.__all__)}")
+    overview = ["# Python", "", "```{eval-rst}", ".. automodule:: slviewer", "```", ""]
+    pages = {}
+    for page, (title, listed) in TOPICS.items():
+        overview += [f"## [{title}]({page}.md)", "", "| name | what it does |", "|---|---|"]
+        lines = [f"# {title}", "", "```{eval-rst}"]
+        for name in listed.split():
+            public = getattr(slviewer, name)
+            first = (inspect.getdoc(public) or "").partition("\n\n")[0].replace("\n", " ")
+            sentence = re.split(r"(?<=[.:])\s|;", first.replace("|", "\\|"))[0].rstrip(".:")
+            target = public.__name__ if inspect.ismodule(public) else f"slviewer.{name}"
+            anchor = f"module-{target}" if inspect.ismodule(public) else target
+            sentence = re.sub(r"`+", "`", sentence)
+            overview.append(
+                f'| <a href="{page}.html#{anchor}"><code>{name}</code></a> | {sentence} |'
+            )
+            lines += _document(public, target)
+        overview.append("")
+        pages[f"reference/{page}"] = "\n".join([*lines, "```", ""])
+    overview += ["```{toctree}", ":hidden:", "", *TOPICS, "```", ""]
+    return {"reference/python": "\n".join(overview), **pages}
+
+
+def _document(public: Any, target: str) -> list[str]:
+    """Return the directive that writes the docstring of a public name."""
+    if not inspect.ismodule(public):
+        return [f".. {'autoclass' if isinstance(public, type) else 'autofunction'}:: {target}", ""]
+    # once is enough for what slviewer exports itself
+    again = ", ".join(sorted(set(slviewer.__all__) & set(getattr(public, "__all__", ()))))
+    return [f".. automodule:: {target}", "   :members:", f"   :exclude-members: {again}", ""]
 
 
 def write_references(app: Sphinx) -> None:
@@ -136,7 +182,7 @@ def write_references(app: Sphinx) -> None:
     }
     for page, text in {
         "reference/cli": list_options(),
-        "reference/python": list_functions(),
+        **list_functions(),
         **pages,
     }.items():
         path = DOCS / f"{page}.md"
@@ -182,11 +228,20 @@ def _show_picture(name: str) -> str:
     )
 
 
+SIMILAR_PICTURES = {
+    "arrays": "compare_models.png",
+    "live_cloud": "wizard_scan.png",
+    "session": "wizard_calibrate.png",
+}
+"""Of examples without a picture of their own: another one's, or the wizard doing the same."""
+
+
 def _describe_card(name: str, page: str) -> str:
-    """Return the HTML of a gallery page's entry: its last picture, where it has one, above its
-    title."""
+    """Return the HTML of a gallery page's entry: its last picture above its title. Raises KeyError
+    where there is no picture."""
     pictures = re.findall(r"!\[\S+\]\(\.\./images/gallery/(\S+)\)", page)
-    shown = f'<img src="../_images/{pictures[-1]}" alt="">' if pictures else ""
+    picture = pictures[-1] if pictures else SIMILAR_PICTURES[name]
+    shown = f'<img src="../_images/{picture}" alt="">'
     return (
         '<a class="entry"'
         f' href="{name}.html">{shown}<span>{html.escape(page[2:].splitlines()[0])}</span></a>'

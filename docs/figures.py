@@ -268,6 +268,11 @@ def draw_pictures() -> None:
     gallery."""
     GALLERY.mkdir(parents=True, exist_ok=True)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    with tempfile.TemporaryDirectory() as images:
+        fetch = [sys.executable, "-m", "slviewer.cli", "fetch", "sample", images]
+        subprocess.run(fetch, env=environment, check=True)
+        arrays = [sys.executable, str(EXAMPLES / "arrays.py"), images, "circles:21x16:9"]
+        subprocess.run([*arrays, str(GALLERY / "arrays.png")], env=environment, check=True)
     for script in sorted(EXAMPLES.glob("*.py")):
         # its only argument is a picture's path
         if "sys.argv[1:]" not in script.read_text(encoding="utf-8"):

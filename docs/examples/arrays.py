@@ -1,4 +1,4 @@
-"""Calibrate from images and measure a plane, all in memory: arrays.py FOLDER BOARD PICTURE.
+"""Arrays: calibrate from images and measure a plane, all in memory: arrays.py FOLDER BOARD PICTURE.
 
 FOLDER holds the target poses in `poses` and one scan in `scan`, in any known layout.
 """

@@ -1,4 +1,4 @@
-"""Reconstruct the scans of a session on a Dask cluster: `pip install 'slviewer[batch]'`.
+"""Dask cluster: reconstruct the scans of a session on one, with `pip install 'slviewer[batch]'`.
 
 Here the cluster is a process of this machine; `scheduler="tcp://host:8786"` names another one.
 """

@@ -1,4 +1,4 @@
-"""Compare the three models on a plane, as error maps."""
+"""Three models: compare them on a plane, as error maps."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Decode a capture and look at it: phase, modulation, and why pixels are masked."""
+"""Decoded capture: its phase, its modulation, and why pixels are masked."""
 
 import sys
 

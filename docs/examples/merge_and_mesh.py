@@ -1,4 +1,4 @@
-"""Merge three scans and mesh the result: an object at three depths before the simulated rig."""
+"""Merge and mesh: three scans of an object at three depths before the simulated rig."""
 
 import sys
 import tempfile

@@ -1,5 +1,5 @@
-"""Calibrate and measure in a session, which stores the captures and every result: session.py FOLDER
-BOARD SESSION."""
+"""Session: calibrate and measure in a folder that stores the captures and every result:
+session.py FOLDER BOARD SESSION."""
 
 import sys
 

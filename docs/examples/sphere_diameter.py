@@ -1,4 +1,4 @@
-"""Measure the diameter of a sphere with its uncertainty, on the sample: calibrate, find the sphere,
+"""Sphere diameter: measure it with its uncertainty, on the sample: calibrate, find the sphere,
 measure it."""
 
 import sys

@@ -29,7 +29,7 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.turning import turning
 
 ROOT = Path(__file__).parents[2]
-GENERATED = {"cli.md", "python.md"}
+GENERATED = {"cli.md", *(path.name for path in (ROOT / "docs" / "reference").glob("python*.md"))}
 WRITTEN = [p for p in (ROOT / "docs").rglob("*.md") if not {"_build", "gallery"} & set(p.parts)]
 PAGES = [ROOT / "README.md", *sorted(WRITTEN)]
 BLOCK = re.compile(

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-GENERATED = re.compile(r"(^|/)(gallery/\w+|cli|python)\.md$")
+GENERATED = re.compile(r"(^|/)(gallery/\w+|cli|python[\w-]*)\.md$")
 """Pages that the site's build writes."""
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
