@@ -83,7 +83,7 @@ class StartPanel(StepPanel):
         self.button("New session", self._make_new, "plus", None)
         with gui.add_folder("Recent sessions") as self._recent_folder:
             self._rows = [RecentSession(self) for _ in range(MOST_RECENT)]
-            self._restore = self.button("Restore", self._restore_last, "arrow-back-up", "orange")
+            self._restore = self.button("Restore", self._restore_last, "arrow-back-up")
         with gui.add_folder("Another folder", expand_by_default=False):
             folder = gui.add_text("Folder", "", hint="Of a session; created if it does not exist")
             self.button("Open session", lambda: self.open_session(folder.value), "folder-open")

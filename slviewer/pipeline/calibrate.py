@@ -376,7 +376,7 @@ def _fit_models(
     settings: CalibrateSettings,
     progress: Progress,
     warn: Warn,
-    excluded: Container[str] = (),
+    excluded: Iterable[str] = (),
 ) -> CalibrationResult:
     """Fit the models that follow from a stereo calibration; return them with the verdict on all:
     stereo alone where that rejects them. One that cannot be fitted is a warning, and stops no
@@ -394,9 +394,7 @@ def _fit_models(
         warn(diagnosed.warning)
     doubts = [finding for finding in verdict.findings if finding.severity == "doubtful"]
     stated = {name for each in doubts for name in each.poses if name in each.sentence}
-    for name, why in stereo.excluded.items():
-        if name not in excluded and name not in stated:
-            warn(f"{name} is excluded: {why}")
+    _warn_of_excluded(stereo, stated.union(excluded), warn)
     few = next((finding for finding in doubts if finding.cause == "too-few-poses"), None)
     models = settings.models or MODELS
     pixelwise, splined, share = None, None, 0.0
@@ -424,6 +422,13 @@ def _fit_models(
     if verdict.level == "rejected":
         return CalibrationResult(stereo, verdict=verdict)
     return CalibrationResult(stereo, pixelwise, splined, verdict)
+
+
+def _warn_of_excluded(stereo: StereoModel, stated: Container[str], warn: Warn) -> None:
+    """Warn of poses that the stereo calibration excluded, but for those already ``stated``."""
+    for name, why in stereo.excluded.items():
+        if name not in stated:
+            warn(f"{name} is excluded: {why}")
 
 
 @contextmanager

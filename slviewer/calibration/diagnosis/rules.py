@@ -473,13 +473,12 @@ def diagnose_pose_count(e: Evidence) -> Iterator[Finding]:
     if count >= needed:
         return
     refused = {pose.name: pose.refused for pose in e.poses if pose.refused}
-    reasons = [f"{name}: {why}" for name, why in refused.items()][:3]
-    because = f" ({'; '.join(reasons)})" if refused else ""
+    because = "; ".join(f"{name}: {why}" for name, why in [*refused.items()][:3])
     wanted = needed if e.is_camera_fixed else POSES_FOR_PIXELWISE
     yield Finding(
         "too-few-poses",
         "rejected" if count < MIN_POSES else "doubtful",
-        f"{count} usable pose{'s' * (count != 1)} of {len(e.poses)}{because}",
+        f"{count} usable pose{'s' * (count != 1)} of {len(e.poses)}{because and f' ({because})'}",
         f"capture the board in more positions and tilts: {wanted} poses at least",
         tuple(refused)[:3],
     )
