@@ -126,6 +126,12 @@ class PanelContext:
         folder = session.folder if session else path.parent
         return self.server.downloads.offer(path, within=folder)
 
+    def offer_archive(self) -> str:
+        """Return the download address of a zip of the session's files and results, without
+        frames."""
+        parts = ("exports", "results", "decisions.json", "session.json")
+        return self.server.downloads.offer_zip(self.session.folder, parts)
+
     def links_html(self, exports: Iterable[ExportView], *names: str) -> str:
         """Return download links to those of the exported files that have one of these names."""
         return "".join(

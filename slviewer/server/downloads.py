@@ -1,9 +1,11 @@
-"""Files offered for download under names that cannot be guessed; no other file can be read."""
+"""Files, and archives of them, offered for download under names that cannot be guessed; no other
+file can be read."""
 
 import contextlib
 import os
 import secrets
 import stat
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -13,6 +15,7 @@ from websockets.datastructures import Headers
 
 from slviewer.errors import InputError
 from slviewer.server.text import safe_file_name
+from slviewer.server.zip_stream import open_zip
 
 PREFIX = "download/"
 """Of addresses, which are relative to the page: the path of the role that may fetch the file stands
@@ -21,12 +24,13 @@ before it."""
 
 @dataclass(frozen=True)
 class Offer:
-    """One file: its path, the folder that it must not leave, and the name under which it is
-    saved."""
+    """One file: its path, the folder that it must not leave, and the name under which it is saved;
+    or the zip of ``parts`` of a folder, files and folders in it."""
 
     path: Path
     within: Path
     name: str
+    parts: tuple[str, ...] = ()
 
 
 class Downloads:
@@ -51,6 +55,16 @@ class Downloads:
             self._offers[address] = offer
         return self._addresses[path]
 
+    def offer_zip(self, folder: Path, parts: Sequence[str]) -> str:
+        """The address, as of `offer`, of a zip of files and folders in a folder: those that exist
+        when it is fetched, without links and hidden ones. It is named after the folder."""
+        key = folder / "*"
+        if key not in self._addresses:
+            name = safe_file_name(f"{folder.name}.zip", "download.zip")
+            address = self._addresses[key] = PREFIX + secrets.token_urlsafe(16)
+            self._offers[address] = Offer(folder, folder.resolve(), name, tuple(parts))
+        return self._addresses[key]
+
     def clear(self) -> None:
         """Withdraw all offered files (another session is opened)."""
         self._offers.clear()
@@ -61,23 +75,38 @@ class Downloads:
         exists."""
         try:
             offer = self._offers[address]
-            file = _open_offer(offer)
+            file = open_zip(_open_parts(offer)) if offer.parts else _open_offer(offer)
         except (KeyError, InputError):
             return None
         ascii_name = (
             offer.name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_")
         )
-        size = os.fstat(file.fileno()).st_size
         headers = Headers(
             {
                 "Content-Type": "application/octet-stream",
-                "Content-Length": str(size),
                 "Content-Disposition": (
                     f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(offer.name)}"
                 ),
             }
         )
+        if not offer.parts:  # the size of a zip is known at its end, where the connection closes
+            headers["Content-Length"] = str(os.fstat(file.fileno()).st_size)
         return headers, file
+
+
+def _open_parts(offer: Offer) -> Iterator[tuple[str, BinaryIO]]:
+    """Open the files of an archive, one after the other, with their names in it; one that has gone
+    meanwhile is skipped."""
+    for part in offer.parts:
+        top = offer.path / part
+        paths = [top] if top.is_file() else sorted(top.rglob("*"))
+        for path in paths:
+            inside = path.relative_to(offer.path)
+            hidden = any(each.startswith(".") for each in inside.parts)
+            if path.is_file() and not path.is_symlink() and not hidden:
+                with contextlib.suppress(InputError):
+                    file = _open_offer(Offer(path, offer.within, path.name))
+                    yield f"{offer.path.name}/{inside.as_posix()}", file
 
 
 def _open_offer(offer: Offer) -> BinaryIO:

@@ -4,10 +4,13 @@ import base64
 import contextlib
 import hashlib
 import html
+import io
 import os
 import re
 import socket
 import threading
+import tracemalloc
+import zipfile
 from collections.abc import Iterator
 
 import pytest
@@ -22,6 +25,7 @@ from slviewer.server.connection import CHUNK
 from slviewer.server.limits import CONNECTIONS
 from slviewer.server.secure import Serving, serve
 from slviewer.server.text import escape, safe_file_name
+from slviewer.server.zip_stream import open_zip
 
 PAGE = "<!doctype html><title>projector</title><script>let a = 1</script>"
 
@@ -87,6 +91,42 @@ def test_a_file_that_becomes_a_link_is_no_longer_sent(operator, tmp_path):
     (session / "a.txt").symlink_to(secret)
     assert operator.get(address).status == 404
     operator.server.downloads.clear()
+
+
+def test_archive_holds_the_parts_and_nothing_else(operator, stranger, tmp_path):
+    session, secret = tmp_path / "session é", tmp_path / "secret.txt"
+    content = os.urandom(3 * CHUNK + 17)
+    wanted = {"exports/part.ply": content, "results/a/meta.json": b"{}", "session.json": b""}
+    for name, data in {**wanted, "captures/frames": b"x", "exports/.part.tmp": b"x"}.items():
+        (session / name).parent.mkdir(parents=True, exist_ok=True)
+        (session / name).write_bytes(data)
+    secret.write_text("secret")
+    (session / "exports" / "link.txt").symlink_to(secret)
+    (session / "results" / "out").symlink_to(tmp_path)
+    os.utime(session / "session.json", (0, 0))  # before a zip's first year
+    downloads = operator.server.downloads
+    address = downloads.offer_zip(session, ("exports", "results", "session.json", "none"))
+    answer = operator.get(address)
+    assert answer.status == 200 and "session%20%C3%A9.zip" in answer.headers["Content-Disposition"]
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        found = {name: archive.read(name) for name in archive.namelist()}
+    assert found == {f"{session.name}/{name}": data for name, data in wanted.items()}
+    assert stranger.get(address).status == 403
+    downloads.clear()
+    assert operator.get(address).status == 404
+
+
+def test_archive_is_read_as_it_is_sent(tmp_path):
+    """An archive takes no more memory than a piece."""
+    (tmp_path / "large").open("wb").truncate(2**28)
+    tracemalloc.start()
+    size = 0
+    with open_zip([("large", (tmp_path / "large").open("rb"))]) as archive:
+        while piece := archive.read(CHUNK):
+            size += len(piece)
+    assert 2**28 < size < 2**28 + 1000 and tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Step 9: write files for other programs, with their units and sizes, and download them."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,17 @@ import numpy as np
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.gui.panel import PanelPart, StepPanel, scan_labels, scan_options
-from slviewer.gui.widgets import Html, Text, link, note, paragraph, records_html, table, to_html
+from slviewer.gui.widgets import (
+    Html,
+    Text,
+    coloured,
+    link,
+    note,
+    paragraph,
+    records_html,
+    table,
+    to_html,
+)
 from slviewer.pipeline.export import (
     What,
     default_file_name,
@@ -103,11 +114,16 @@ class ExportPanel(StepPanel):
         gui, operator = self._gui, self._operator
         with gui.add_folder("Files"):
             self._files = Text(gui)
+            self._archive = Text(gui)
         with gui.add_folder("Cloud or mesh"):
             self._source = self.choice("Source")
             self._finish = self.button(
-                "Write textured mesh", self._request_textured, "brush",
+                "Write textured mesh", partial(self._request_mesh, "glb", TEXTURE), "brush",
                 hint="GLB with an image of the surface, 2048 px: for viewers and presentations",
+            )  # fmt: skip
+            self._stl = self.button(
+                "Write STL", partial(self._request_mesh, "stl"), "cube",
+                hint="The mesh alone, for CAD and printing",
             )  # fmt: skip
             self._as = self.dropdown("Type", (POINTS, MESH))
             self._mesh = MeshInputs(self)
@@ -164,6 +180,7 @@ class ExportPanel(StepPanel):
         that exist, and request the cloud."""
         session, calibration, busy = self.session, self.session.calibration, self.snapshot.is_busy
         self._files.set(self._files_html(session))
+        self._archive.set("" if calibration is None else self._archive_html())
         things = {"merged scans": MERGED} if session.merge else {}
         things |= scan_options(scan for scan in session.scans if scan.cloud != "absent")
         self._source.offer(things)
@@ -174,7 +191,8 @@ class ExportPanel(StepPanel):
         self._report.disabled = busy or self.is_blocked
         self._draw_details(session.report_details)
         self._write_numbers.disabled = unusable or self.is_blocked
-        self._write.disabled = self._finish.disabled = unusable or not things
+        for button in (self._write, self._finish, self._stl):
+            button.disabled = unusable or not things
         self._table.disabled = busy or not session.records
         self._figures_folder.visible = bool(session.records)
         if session is not self._drawn:
@@ -290,12 +308,12 @@ class ExportPanel(StepPanel):
             white = BOARD if texture is not None and self._white.value else ""
             self._operator.export(what, name, chosen, plan, texture, white)
 
-    def _request_textured(self) -> None:
-        """Choose a mesh with a texture as GLB, and request its file."""
+    def _request_mesh(self, file_format: str, texture_px: int | None = None) -> None:
+        """Choose a mesh of this format, and request its file."""
         self._as.value = MESH
-        self._texture.choose(TEXTURE)
+        self._texture.choose(texture_px)
         self._describe_shape()  # offers the formats of a mesh
-        self._shape_format.choose("glb")
+        self._shape_format.choose(file_format)
         self._request_shape()
 
     # files
@@ -316,6 +334,12 @@ class ExportPanel(StepPanel):
             f'<div style="max-height:{LIST_PX}px;overflow-y:auto">'
             f"{table(('File', 'Size', ''), rows)}</div>"
         )
+
+    def _archive_html(self) -> Html:
+        """Return a link to all files and results in one zip."""
+        address = to_html(self.context.offer_archive())
+        text = f'<a href="{address}" download style="{_QUIET}">Download all as one zip</a>'
+        return paragraph(Html(f"{text} {coloured('files and results, without frames', 'dim')}"))
 
     def _result_text(self, export: ExportView) -> str:
         """Return the notice about this file, without its name; empty where it is no longer among
