@@ -27,8 +27,15 @@ from slviewer.geometry.rigid import (
     transform_from_rvec,
 )
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
-from slviewer.geometry.vectors import finite_rows, lengths, rms_length, unit_vectors
-from slviewer.records.calibration import StereoFit, describe_stereo
+from slviewer.geometry.vectors import (
+    finite_rows,
+    lengths,
+    rms,
+    rms_length,
+    shared_rms,
+    unit_vectors,
+)
+from slviewer.records.calibration import Reprojection, StereoFit, describe_stereo
 from slviewer.records.plain import from_plain, to_plain
 
 MIN_FEATURES = 12
@@ -87,6 +94,19 @@ class StereoModel:
         return float(np.linalg.norm(self.rig.t))
 
     @property
+    def reprojection(self) -> Reprojection:
+        """The residuals by pose; their pattern where the residuals themselves are at hand."""
+        errors = [*self.residuals_px.values()]
+        parts = zip(DEVICES, (np.s_[:2], np.s_[2:]), strict=True)
+        pattern_px = {
+            device: rms([shared_rms(each[:, part]) for each in errors])
+            for device, part in parts
+            if errors
+        }
+        total = {each: px for each, px in self.reprojection_rms_px.items() if each in DEVICES}
+        return Reprojection("stereo", total, dict(self.pose_rms_px), pattern_px)
+
+    @property
     def pinholes(self) -> StereoRig:
         """The rig as two pinhole cameras, which is the model itself."""
         return self.rig
@@ -98,12 +118,12 @@ class StereoModel:
         It holds noise and the lens distortion that Brown's polynomial lacks; 0 for a calibration
         made elsewhere.
         """
-        rms = self.reprojection_rms_px
-        if not rms:
+        total = self.reprojection_rms_px
+        if not total:
             return 0.0
         magnification = self.rig.projector.K[1, 1] / self.rig.camera.K[1, 1]
         # of one coordinate
-        return float(np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2))
+        return float(np.hypot(total["projector"], magnification * total["camera"]) / np.sqrt(2))
 
     def undistort_pairs(
         self, camera_pixels: Floats, projector_pixels: Floats
@@ -141,7 +161,8 @@ class StereoModel:
 
     def describe(self) -> StereoFit:
         """Return the figures of the fit."""
-        return from_plain(describe_stereo(self.to_dict()), StereoFit)
+        pattern_px = self.reprojection.pattern_px
+        return from_plain(describe_stereo(self.to_dict()) | {"pattern_px": pattern_px}, StereoFit)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "StereoModel":
@@ -251,13 +272,13 @@ def _solve(
         residuals[o.name] = np.where(inliers[o.name][:, None], errors, np.nan)
         depths.append(X[:, 2])
     z = np.concatenate(depths)
-    rms = dict(zip(DEVICES, _device_rms(np.concatenate([*residuals.values()])), strict=True))
-    rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
+    total = dict(zip(DEVICES, _device_rms(np.concatenate([*residuals.values()])), strict=True))
+    total["stereo"] = float(np.sqrt((total["camera"] ** 2 + total["projector"] ** 2) / 2))
     return StereoModel(
         rig=rig,
         board="",
         axes=("x", "y"),
-        reprojection_rms_px=rms,
+        reprojection_rms_px=total,
         poses=poses,
         pose_rms_px={name: _device_rms(each) for name, each in residuals.items()},
         excluded={},
@@ -343,12 +364,12 @@ def _device_rms(residuals: Floats) -> tuple[float, float]:
 def _check_agreement(model: StereoModel) -> None:
     """Raise CalibrationRejected where the reprojection error is too large or a board is behind the
     camera."""
-    rms = model.reprojection_rms_px
-    if rms["stereo"] > MAX_REPROJECTION_PX:
+    total = model.reprojection_rms_px
+    if total["stereo"] > MAX_REPROJECTION_PX:
         raise CalibrationRejected(
-            f"the reprojection error is {rms['stereo']:.1f} px (camera {rms['camera']:.1f},"
-            f" projector {rms['projector']:.1f}), above {MAX_REPROJECTION_PX:g}: check the target's"
-            " notation, the projector's size, the fringe period, and that x and y are not"
+            f"the reprojection error is {total['stereo']:.1f} px (camera {total['camera']:.1f},"
+            f" projector {total['projector']:.1f}), above {MAX_REPROJECTION_PX:g}: check the"
+            " target's notation, the projector's size, the fringe period, and that x and y are not"
             " exchanged"
         )
     if model.depth_range_mm is not None and model.depth_range_mm[0] <= 0:

@@ -35,6 +35,15 @@ def rms_length(vectors: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.sum(vectors**2, axis=1))))
 
 
+def shared_rms(vectors: np.ndarray) -> float:
+    """Return the root mean square length of what neighbours among vectors (n, k) share, those of
+    consecutive rows: of a pattern, to which independent noise adds nothing; NaN rows do not
+    count."""
+    products = np.sum(vectors[1:] * vectors[:-1], axis=1)
+    products = products[np.isfinite(products)]
+    return float(np.sqrt(max(products.mean(), 0.0))) if len(products) else 0.0
+
+
 def finite_rows(*arrays: np.ndarray) -> np.ndarray:
     """Return where (...) all values along the last axis of every array (..., k) are finite."""
     return np.logical_and.reduce([np.isfinite(each).all(axis=-1) for each in arrays])

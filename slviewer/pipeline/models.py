@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE, PixelwiseModel
@@ -22,7 +23,7 @@ from slviewer.pipeline.stored_records import (
     read_record,
     save_record,
 )
-from slviewer.records.calibration import ModelCalibration
+from slviewer.records.calibration import ModelCalibration, Reprojection, SplinedFit, StereoFit
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
@@ -209,6 +210,17 @@ def load_residuals(store: Session) -> dict[str, np.ndarray]:
     made elsewhere."""
     arrays, start = store.load_result("calibration/stereo")[1], "residuals_"
     return {name.removeprefix(start): r for name, r in arrays.items() if name.startswith(start)}
+
+
+def load_reprojection(store: Session, stereo: StereoModel, model: str) -> Reprojection:
+    """Return the residuals of the target poses by the ``model`` in use where it has any, else by
+    the ``stereo`` one, which it refines."""
+    fit = load_record(store, ModelCalibration, model).fit if model == "splined" else None
+    if isinstance(fit, SplinedFit) and fit.reprojection is not None:
+        return fit.reprojection
+    of_stereo = load_record(store, ModelCalibration, "stereo").fit
+    pattern_px = of_stereo.pattern_px if isinstance(of_stereo, StereoFit) else {}
+    return msgspec.structs.replace(stereo.reprojection, pattern_px=pattern_px)
 
 
 def load_model(store: Session, name: str | None) -> Model:

@@ -12,7 +12,9 @@ import numpy as np
 
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel, pixel_samples
-from slviewer.calibration.stereo import StereoModel
+from slviewer.calibration.splined.adjust import pose_residuals
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.errors import DamagedError, InputError, SlviewerError
 from slviewer.evaluation.render import format_count, render
 from slviewer.fringe.sequence import Axis
@@ -23,6 +25,7 @@ from slviewer.pipeline.measure import describe_measurement, section_lines
 from slviewer.pipeline.models import (
     available_models,
     load_model,
+    load_reprojection,
     load_residuals,
     load_stereo,
     load_stereo_if_complete,
@@ -165,25 +168,25 @@ def _collect_data(store: Session) -> SessionData:
         if store.state_of(f"calibration/{name}") == "stale"
     ]
     excluded = store.excluded()
-    verdict, pixel_fits = load_last_verdict(store), dict[str, np.ndarray]()
+    pixel_fits = dict[str, np.ndarray]()
     if "pixelwise" in there:
         pixelwise = load_model(store, "pixelwise")
         assert isinstance(pixelwise, PixelwiseModel)
         pixel_fits = {axis: fit.rms_mm for axis, fit in pixelwise.fits.items()}
-    judged = None if stereo is None else load_record(store, ModelCalibration, "stereo").verdict
+    figures = None if stereo is None else calibration_view(store)
+    model = preferred_model(store) if there else ""
     records, outdated = _collect_records(store)
     known = _list_known_shapes(store, records)
     region = load_region(store)
     return SessionData(
         name=store.folder.name,
         captures=[_describe_use(c, stereo, excluded, known) for c in store.captures()],
-        calibration=None if stereo is None else calibration_view(store),
+        calibration=figures,
         pixel_fits=pixel_fits,
         records=records,
         warnings=[*stale, *outdated],
-        verdict=verdict,
-        verdict_of_calibration=verdict is not None and verdict == judged,
-        model=preferred_model(store) if there else "",
+        **_judge(store, figures, model),
+        model=model,
         recommended=recommended_model(store) if there else "",
         scales={name: words for name in there if (words := describe_scale(store, name))},
         region="" if region is None else region.text(),
@@ -239,6 +242,17 @@ def _draw_part(store: Session, known: Collection[str]) -> Iterator[Figure]:
         yield surface
 
 
+def _judge(store: Session, figures: CalibrationFigures | None, model: str) -> dict[str, Any]:
+    """Return the verdict on the last attempt to calibrate, and whether that made the calibration
+    whose ``figures`` are shown: then with what these show of the ``model`` in use."""
+    verdict = load_last_verdict(store)
+    if verdict is None or figures is None:
+        return {"verdict": verdict, "verdict_of_calibration": False}
+    if verdict != load_record(store, ModelCalibration, "stereo").verdict:
+        return {"verdict": verdict, "verdict_of_calibration": False}
+    return {"verdict": figures.reprojection.judge(verdict, model)}
+
+
 def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
     """Return the records made from what the session holds now, by kind, with pictures of the first
     ones; and warnings of the others."""
@@ -291,17 +305,30 @@ def _describe_use(
 
 
 def calibration_view(store: Session) -> CalibrationFigures:
-    """The session's stereo calibration as figures and tables show it, with every pose's residuals.
+    """The session's calibration as figures and tables show it, with every pose's residuals by the
+    model in use, or by stereo where that has none.
 
     Raises InputError where there is none.
     """
-    stereo, residuals = load_stereo(store), load_residuals(store)
-    views = {
-        o.name: {"camera": (o.camera, r[:, :2]), "projector": (o.projector, r[:, 2:])}
-        for o in load_observations(store, list(stereo.poses))
-        if (r := residuals.get(o.name)) is not None
-    }
-    return CalibrationFigures(stereo, views)
+    stereo, model = load_stereo(store), preferred_model(store)
+    reprojection = load_reprojection(store, stereo, model)
+    observations = load_observations(store, list(stereo.poses))
+    views = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]()
+    if reprojection.model == "splined":
+        fitted = load_model(store, model)
+        assert isinstance(fitted, SplinedModel)
+        for o in observations:
+            if (each := pose_residuals(fitted.bundle, o)) is not None:
+                views[o.name] = dict(zip(DEVICES, each, strict=True))
+    else:
+        residuals = load_residuals(store)
+        for o in observations:
+            if (r := residuals.get(o.name)) is not None:
+                views[o.name] = {
+                    "camera": (o.camera, r[:, :2]),
+                    "projector": (o.projector, r[:, 2:]),
+                }
+    return CalibrationFigures(stereo, reprojection, views)
 
 
 def curve_at(
@@ -402,9 +429,10 @@ def _describe_calibration(store: Session, name: str) -> list[str]:
     mark = ", the default" if name == preferred_model(store) else ""
     if "imported" not in meta:
         lines = [f"calibration {name}: from {len(meta['inputs'])} poses, {state}{mark}"]
-        if name == "stereo":
-            rms = load_stereo(store).reprojection_rms_px.items()
-            lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms))
+        of = load_reprojection(store, load_stereo(store), name)
+        if of.model == name:
+            errors = ", ".join(f"{device} {px:.3f} px" for device, px in of.rms_px.items())
+            lines.append(f"  reprojection RMS {errors}")
         return lines
     lines = [f"calibration {name}: imported from {meta['source']}, {state}{mark}"]
     for device in ("camera", "projector"):

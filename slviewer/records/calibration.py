@@ -9,17 +9,66 @@ import msgspec
 
 from slviewer.records.record import Count, Record, Share
 from slviewer.records.table import Column, Table
-from slviewer.records.verdict import Verdict
+from slviewer.records.verdict import Finding, Verdict
 
 MIN_WEIGHT = 0.7
 """Undisturbed poses have weights of 0.8 or more in the joint adjustment; those below this are
 listed."""
 
 
+MIN_PATTERN_PX, MIN_PATTERN_SHARE = 0.03, 0.7
+"""RMS px of the pattern in a model's residuals, and over their RMS, above both of which it is
+reported: then half of the squared residuals are no noise."""
+
+
+def is_pattern(shared_px: float, rms_px: float) -> bool:
+    """Return whether residuals are a pattern rather than noise, by the RMS of what neighbours
+    share and by their own."""
+    return shared_px > max(MIN_PATTERN_PX, MIN_PATTERN_SHARE * rms_px)
+
+
+class Reprojection(msgspec.Struct, frozen=True):
+    """Residuals of a ``model`` on the target poses that it was made from, by "camera" and
+    "projector": ``rms_px`` of all, ``pose_rms_px`` (camera, projector) of each, and ``pattern_px``,
+    the RMS of what neighbouring residuals share, which the model lacks; empty where not known."""
+
+    model: str
+    rms_px: dict[str, float]
+    pose_rms_px: dict[str, tuple[float, float]]
+    pattern_px: dict[str, float] = {}
+
+    @property
+    def patterns(self) -> dict[str, float]:
+        """The pattern, px, by device where it is more than half of the squared residuals."""
+        return {
+            device: px
+            for device, px in self.pattern_px.items()
+            if is_pattern(px, self.rms_px[device])
+        }
+
+    def judge(self, verdict: Verdict, model: str) -> Verdict:
+        """Return the verdict on a calibration with a finding added where the ``model`` in use is
+        the one of the residuals, and these are a pattern."""
+        if model != self.model or not self.patterns or "residuals" in verdict.causes:
+            return verdict
+        parts = " and ".join(
+            f"{px:.2f} of {self.rms_px[device]:.2f} px in the {device}"
+            for device, px in self.patterns.items()
+        )
+        remedy = (
+            "use the splined model, which follows what the lenses lack"
+            if model == "stereo"
+            else "see that board, light and rig do not change while a pose is captured"
+        )
+        sentence = f"the residuals of the {model} model are a pattern, not noise: {parts}"
+        return Verdict.of([*verdict.findings, Finding("residuals", "doubtful", sentence, remedy)])
+
+
 class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
     """The ``poses`` used, and why others are ``excluded``; RMS residuals of "camera", "projector"
-    and "stereo", both together; focal lengths in x and y with their standard deviations, by device;
-    the nearest and the farthest board; the file whose lens the camera kept.
+    and "stereo", both together, and of the pattern in them; focal lengths in x and y with their
+    standard deviations, by device; the nearest and the farthest board; the file whose lens the
+    camera kept.
     """
 
     poses: tuple[str, ...]
@@ -31,13 +80,14 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
     depth_range_mm: tuple[float, float] | None = None
     features_excluded: Count = 0
     fixed_camera: str = ""
+    pattern_px: dict[str, float] = {}
 
     def summary(self) -> str:
         """Return the number of poses and the reprojection error in one sentence."""
         if not self.poses:
             return f"made elsewhere, baseline {self.baseline_mm:.2f} mm"
         rms = self.reprojection_rms_px.get("stereo", float("nan"))
-        return f"calibrated from {len(self.poses)} poses: reprojection RMS {rms:.3f} px"
+        return f"calibrated from {len(self.poses)} poses: stereo reprojection RMS {rms:.3f} px"
 
     def figures(self) -> dict[str, float]:
         """Return the reprojection errors and the baseline."""
@@ -54,6 +104,7 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
         focal = {device: self.focal_px.get(device, (None, None)) for device in devices}
         figures: dict[str, Mapping[str, float | None]] = {
             "reprojection RMS, px": {**rms, "both": rms.get("stereo")},
+            "pattern in the residuals, RMS, px": self.pattern_px,
             "focal length x, px": {device: x for device, (x, _) in focal.items()},
             "focal length y, px": {device: y for device, (_, y) in focal.items()},
             "standard deviation of the focal length, px": sigma,
@@ -139,8 +190,9 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
     """The joint adjustment. Residuals by "camera" and the projector's axes "x" and "y":
     ``noise_px``, and ``residuals_over_noise``, times their predicted noise. ``cells_lit``: share of
     each device's cells that target poses illuminated. ``weights`` of each pose in camera and
-    projector, 0 to 1. ``excluded``: {pose: why}; ``turned``: poses numbered from the board's other
-    end."""
+    projector, 0 to 1. ``pose_rms_px``: (camera, projector) of each pose, without outliers;
+    ``pattern_px``: of "camera" and "projector". ``excluded``: {pose: why}; ``turned``: poses
+    numbered from the board's other end."""
 
     steps: Count
     residuals_over_noise: dict[str, float]
@@ -153,6 +205,20 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
     weights: dict[str, tuple[float, float]] = {}
     excluded: dict[str, str] = {}
     turned: tuple[str, ...] = ()
+    pose_rms_px: dict[str, tuple[float, float]] = {}
+    pattern_px: dict[str, float] = {}
+
+    @property
+    def reprojection(self) -> Reprojection | None:
+        """The residuals by pose; None in a record of an older version."""
+        used = [px for name, px in self.pose_rms_px.items() if name not in self.excluded]
+        if not used:
+            return None
+        rms = {
+            device: (sum(px[i] ** 2 for px in used) / len(used)) ** 0.5
+            for i, device in enumerate(("camera", "projector"))
+        }
+        return Reprojection("splined", rms, self.pose_rms_px, self.pattern_px)
 
     def summary(self) -> str:
         """Return the residuals in one sentence."""
@@ -179,7 +245,21 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
         low, high = self.board_height_mm
         near, far = sigma.depths_mm
         u, v, z = sigma.worst_at
-        figures = {
+        shown = self.reprojection
+        figures = (
+            {}
+            if shown is None
+            else {
+                "Reprojection RMS, camera / projector": (
+                    f"{shown.rms_px['camera']:.3f} / {shown.rms_px['projector']:.3f} px"
+                )
+            }
+        )
+        if self.pattern_px:
+            figures["Pattern in the residuals, camera / projector"] = (
+                f"{self.pattern_px['camera']:.3f} / {self.pattern_px['projector']:.3f} px"
+            )
+        figures |= {
             "Residual noise, camera": f"{noise['camera']:.4f} px",
             "Residual noise, projector x / y": f"{noise['x']:.4f} / {noise['y']:.4f} px",
             "Residuals over predicted noise": f"{max(self.residuals_over_noise.values()):.1f}",
@@ -238,6 +318,12 @@ class ModelCalibration(Record, frozen=True, kw_only=True):
         the operation."""
         if isinstance(imported := meta.get("imported"), Mapping):
             return {**meta, "fit": _describe_imported(imported)}
+        if isinstance(fit := meta.get("fit"), Mapping) and "fits" in meta["model"]:
+            residuals = {
+                name: (each["camera_rms_px"], each["projector_rms_px"])
+                for name, each in meta["model"]["fits"].items()
+            }
+            return {**meta, "fit": {"pose_rms_px": residuals, **fit}}
         if "fit" in meta or "settings" not in meta:
             return meta
         model = meta.get("model", {})

@@ -1,10 +1,12 @@
 """Figures of reprojection errors of the target poses, and of their coverage of the image."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from slviewer.geometry.vectors import shared_rms, subsample
+from slviewer.records.calibration import Reprojection, is_pattern
 from slviewer.report.canvas import (
     FULL,
     HALF,
@@ -20,27 +22,22 @@ from slviewer.report.canvas import (
 )
 from slviewer.report.page import Figure
 
+MOST_ARROWS = 600
 CAMERA, PROJECTOR = "#3c6e9e", "#c98a1b"
 
 
-def pose_bars(
-    pose_rms_px: Mapping[str, tuple[float, float]],
-    rms_px: Mapping[str, float],
-    *,
-    width: int = FULL,
-) -> Figure:
-    """Reprojection RMS of each pose, camera and projector side by side; ``rms_px``: the RMS over
-    all features."""
-    names = list(pose_rms_px)
-    values = np.array([pose_rms_px[name] for name in names], float)
+def pose_bars(of: Reprojection, *, width: int = FULL) -> Figure:
+    """Reprojection RMS of each pose by a model, camera and projector side by side."""
+    names = list(of.pose_rms_px)
+    values = np.array([of.pose_rms_px[name] for name in names], float)
     narrow = width <= HALF
     drawing = new_figure(width, 260 if narrow else 300)
     axes = drawing.subplots()
-    style_axes(axes, "", "", "reprojection RMS, px")
+    style_axes(axes, "", "", f"reprojection RMS, {of.model}, px")
     axes.grid(False, axis="x")
     at = np.arange(len(names))
     for i, (device, colour) in enumerate((("camera", CAMERA), ("projector", PROJECTOR))):
-        rms = rms_px.get(device, np.nan)
+        rms = of.rms_px.get(device, np.nan)
         label = (
             f"{device}, {'all' if narrow else 'all poses'} {rms:.3f} px"
             if np.isfinite(rms)
@@ -56,8 +53,8 @@ def pose_bars(
     worst = names[int(np.argmax(np.nan_to_num(values).max(axis=1)))]
     return finish_figure(
         drawing,
-        "Reprojection error of each target pose. Dashed: the RMS over all poses. The worst pose is"
-        f" {worst}.",
+        f"Reprojection error of each target pose by the {of.model} model. Dashed: the RMS over all"
+        f" poses. The worst pose is {worst}.",
         f"Bars of the reprojection error of {len(names)} poses, camera and projector; worst"
         f" {worst}",
     )
@@ -67,7 +64,9 @@ def residual_arrows(
     title: str, pixels: np.ndarray, residuals: np.ndarray, size: tuple[int, int]
 ) -> Figure:
     """Residuals (n, 2) px as arrows at ``pixels`` (n, 2) in an image of ``size`` = (width, height),
-    magnified."""
+    magnified, at most ``MOST_ARROWS``; consecutive ones are neighbours, and the caption says
+    whether these agree."""
+    shared = shared_rms(residuals)
     known = np.isfinite(pixels).all(axis=1) & np.isfinite(residuals).all(axis=1)
     at, away = pixels[known], residuals[known]
     lengths = np.hypot(away[:, 0], away[:, 1])
@@ -77,9 +76,9 @@ def residual_arrows(
     drawing, axes = _new_image_axes(size, f"{title}: RMS {rms:.3f} px")
     if len(at):
         arrows = axes.quiver(
-            *at.T,
-            *(scale * away.T),
-            lengths,
+            *subsample(at, MOST_ARROWS).T,
+            *(scale * subsample(away, MOST_ARROWS).T),
+            subsample(lengths, MOST_ARROWS),
             angles="xy",
             scale_units="xy",
             scale=1,
@@ -103,10 +102,14 @@ def residual_arrows(
         )
     return finish_figure(
         drawing,
-        f"{title}: measured minus predicted features, arrows drawn {scale:g} times as long as they"
-        " are. Arrows without a pattern are noise; a swirl or a common direction means a lens,"
-        " board or pose that the model lacks.",
-        f"Residual arrows of {len(at)} features in {title}; RMS {rms:.3f} px",
+        f"{title}: measured minus predicted positions, arrows drawn {scale:g} times as long as they"
+        f" are. Neighbours share {shared:.3f} px of {rms:.3f} px: "
+        + (
+            "a pattern, of a lens, board or pose as this model does not know it."
+            if is_pattern(shared, rms)
+            else "noise."
+        ),
+        f"Residual arrows of {len(at)} positions in {title}; RMS {rms:.3f} px",
     )
 
 

@@ -15,7 +15,7 @@ from slviewer.evaluation.render import format_count
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
 from slviewer.records.acceptance import MARKS, AcceptanceTest, Decision, worst_decision
-from slviewer.records.calibration import ModelCalibration
+from slviewer.records.calibration import ModelCalibration, Reprojection
 from slviewer.records.drift import Drift
 from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
 from slviewer.records.measurement import Measurement
@@ -74,10 +74,12 @@ class CaptureUse:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFigures:
-    """A stereo calibration, and of each pose and device where its features are, pixels (n, 2), and
-    their residuals (n, 2) px, NaN where excluded or not read; empty where none were saved."""
+    """A stereo calibration, the residuals of the model in use where it has any, else of stereo, and
+    of each pose and device where these are, pixels (n, 2), and they themselves (n, 2) px, NaN where
+    excluded or not read; empty where none were saved."""
 
     stereo: StereoModel
+    reprojection: Reprojection
     residuals: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]] = field(
         default_factory=dict
     )
@@ -347,29 +349,30 @@ def _captures_section(data: SessionData) -> Section:
 def _reprojection_section(calibration: CalibrationFigures) -> Section:
     """The section about reprojection errors: bars of each pose, residual arrows and image
     coverage."""
-    stereo, residuals = calibration.stereo, calibration.residuals
-    rms = stereo.reprojection_rms_px
+    stereo, residuals, of = calibration.stereo, calibration.residuals, calibration.reprojection
     sizes = {device: getattr(stereo.rig, device).size for device in DEVICES}
     items: list[Item] = []
-    if stereo.pose_rms_px:
-        items.append(pose_bars(stereo.pose_rms_px, rms))
+    if of.pose_rms_px:
+        items.append(pose_bars(of))
     if residuals:
-        worst = max(residuals, key=lambda name: max(stereo.pose_rms_px.get(name, (0.0, 0.0))))
+        worst = max(residuals, key=lambda name: max(of.pose_rms_px.get(name, (0.0, 0.0))))
         items += [
-            residual_arrows(f"{device}, {worst} (the worst pose)", *residuals[worst][device], size)
+            residual_arrows(
+                f"{device}, {of.model}, {worst} (the worst pose)", *residuals[worst][device], size
+            )
             for device, size in sizes.items()
         ]
         items += [
             coverage(device, size, [each[device][0] for each in residuals.values()])
             for device, size in sizes.items()
         ]
-    if stereo.pose_rms_px:
-        items.append(_pose_table(stereo.pose_rms_px))
+    if of.pose_rms_px:
+        items.append(_pose_table(of))
     text = ["This calibration was made elsewhere, without a reprojection error."]
-    if rms:
-        errors = ", ".join(f"{device} {value:.3f}" for device, value in rms.items())
+    if of.rms_px:
+        errors = ", ".join(f"{device} {value:.3f}" for device, value in of.rms_px.items())
         text = [
-            "How far the target's features lie from where the calibration predicts them, in px:"
+            f"How far the target lies from where the {of.model} model predicts it, RMS in px:"
             f" {errors}. Target: {stereo.board}."
         ]
     if excluded := stereo.features_excluded:
@@ -377,17 +380,17 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
     return Section("Reprojection", text, items)
 
 
-def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
+def _pose_table(of: Reprojection) -> Table:
     """Table of reprojection RMS by pose, px, with conspicuous poses marked."""
-    typical = np.sqrt(np.nanmean(np.square(list(pose_rms_px.values())), axis=0))
+    typical = np.sqrt(np.nanmean(np.square(list(of.pose_rms_px.values())), axis=0))
     rows = []
-    for name, values in pose_rms_px.items():
+    for name, values in of.pose_rms_px.items():
         high = np.array(values) > WORST * typical
         row: dict[Any, Value | Cell] = {"pose": name}
         for device, value, is_high in zip(DEVICES, values, high, strict=True):
             row[Column(device, "px")] = Cell(value, "worse" if is_high else "")
         rows.append({**row, "": Cell("look at this pose" if high.any() else "", "worse")})
-    return Table.of(rows, "Reprojection RMS of each pose").without_empty()
+    return Table.of(rows, f"Reprojection RMS of each pose, {of.model}").without_empty()
 
 
 def lens_table(stereo: StereoModel) -> Table:

@@ -20,6 +20,7 @@ from slviewer.pipeline.models import (
     explain_board,
     find_target,
     load_model,
+    load_reprojection,
     load_stereo_if_complete,
     preferred_model,
     recommended_model,
@@ -202,7 +203,7 @@ class SessionReader:
         given = self._plan_input(target, calibration, rig, focal_px, features, refused)
         plan, is_final = self._planner.look_up(given) if given else (None, True)
         poses = plan.poses if plan else {}
-        used_px = calibration.stereo.pose_rms_px if calibration else {}
+        used_px = calibration.reprojection.pose_rms_px if calibration else {}
         views = tuple(
             PoseView(
                 name=pose.name,
@@ -302,11 +303,12 @@ class SessionReader:
             if None in fits.values()
             else ""
         )
-        chosen = session.valid_decision("model")
+        chosen, best = session.valid_decision("model"), preferred_model(session)
         return CalibrationView(
             stereo=stereo,
+            reprojection=load_reprojection(session, stereo, best),
             models=models,
-            best=preferred_model(session),
+            best=best,
             stale=foreign or self._describe_changes(meta["inputs"]),
             pixelwise=fits.get("pixelwise"),
             recommended=recommended_model(session),

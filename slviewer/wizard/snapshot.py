@@ -16,7 +16,7 @@ from slviewer.pipeline.capture import Space
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.stored_records import Stored
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
-from slviewer.records.calibration import PixelwiseFit, SplinedFit
+from slviewer.records.calibration import PixelwiseFit, Reprojection, SplinedFit
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Merge, Placement
 from slviewer.records.reconstruction import Reconstruction
@@ -146,7 +146,8 @@ class PoseView:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
-    """The session's calibration: the `stereo` model, and what is known of the others.
+    """The session's calibration: the `stereo` model, the residuals of the model in use where it
+    has any, and what is known of the others.
 
     `stale` names what changed since, empty where nothing did. `pixelwise`, `splined`: their fits,
     None where there is no such model. `best` is the model in use, `recommended` the one that would
@@ -157,6 +158,7 @@ class CalibrationView:
     """
 
     stereo: StereoModel
+    reprojection: Reprojection
     models: tuple[str, ...]
     best: str
     stale: str = ""
@@ -168,6 +170,12 @@ class CalibrationView:
     splined: SplinedFit | None = None
     scales: Mapping[str, str] = field(default_factory=dict)
     missing: str = ""
+
+    @property
+    def label(self) -> str:
+        """The model whose residuals are shown, as texts name it."""
+        model = self.reprojection.model
+        return model if model == self.best else f"{model}, which {self.best} refines"
 
     @property
     def refused(self) -> str:

@@ -204,12 +204,12 @@ def _describe_calibration(calibration: CalibrationView) -> str:
     """Return the number of poses and the reprojection RMS, and what follows."""
     if calibration.refused:
         return "This calibration was rejected: correct what is listed below, and calibrate again."
-    rms = calibration.stereo.reprojection_rms_px.get("stereo")
-    if rms is None:
+    if not (rms := calibration.reprojection.rms_px):
         return "This calibration was imported: verify it next."
+    errors = ", ".join(f"{device} {px:.3f} px" for device, px in rms.items())
     return (
-        f"Calibrated from {len(calibration.stereo.poses)} poses, reprojection RMS {rms:.3f} px:"
-        " check outlying poses, then verify."
+        f"Calibrated from {len(calibration.stereo.poses)} poses. Reprojection RMS of"
+        f" {calibration.label}: {errors}. Check outlying poses, then verify."
     )
 
 

@@ -19,11 +19,13 @@ from splined_rig import (
 )
 
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.splined.adjust import adjust_bundle
+from slviewer.calibration.splined.adjust import adjust_bundle, pose_residuals
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.splined.unknowns import board_frame, board_heights
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import rms_length, shared_rms
+from slviewer.records.verdict import Verdict
 from slviewer.simulation.boards import BoardShape, printed_board
 
 pytestmark = pytest.mark.computes
@@ -187,3 +189,33 @@ def test_a_scan_of_another_period_or_of_the_wrong_size(model, true) -> None:
     )
     with pytest.raises(InputError):
         model.points(small)
+
+
+def test_residuals_are_noise_where_those_of_stereo_are_a_pattern(model, seen, stereo) -> None:
+    of_stereo, of_splined = stereo.describe(), model.describe().reprojection
+    assert of_splined is not None and of_splined.patterns == {}
+    assert set(stereo.reprojection.patterns) == {"camera", "projector"}
+    assert of_stereo.pattern_px == stereo.reprojection.pattern_px
+    for device, px in of_splined.rms_px.items():
+        assert px < 0.5 * stereo.reprojection.rms_px[device]
+    good, used = Verdict(), stereo.reprojection
+    assert of_splined.judge(good, "splined").level == "good"
+    assert used.judge(good, "pixelwise").level == "good"  # it corrects the pattern
+    (finding,) = used.judge(good, "stereo").findings
+    assert finding.cause == "residuals" and finding.severity == "doubtful"
+    for each in seen:
+        parts = pose_residuals(model.bundle, each)
+        assert parts is not None
+        errors = [rms_length(residuals) for _, residuals in parts]
+        assert errors == pytest.approx(of_splined.pose_rms_px[each.name], rel=1e-6)
+    assert pose_residuals(model.bundle, replace(seen[0], name="another")) is None
+
+
+def test_shared_rms_is_that_of_the_pattern_alone() -> None:
+    rng, n = np.random.default_rng(1), 20_000
+    swirl = 0.2 * np.column_stack([np.cos(np.arange(n) / 50), np.sin(np.arange(n) / 50)])
+    noise = rng.normal(0, 0.1, (n, 2))
+    noise[7] = np.nan
+    assert shared_rms(swirl + noise) == pytest.approx(0.2, rel=0.03)
+    assert shared_rms(noise) < 0.02
+    assert shared_rms(noise[:1]) == 0.0

@@ -301,7 +301,7 @@ def session_data(width: int = 1600) -> SessionData:
     return SessionData(
         name="Vase <script>alert(1)</script>",
         captures=captures,
-        calibration=CalibrationFigures(stereo, residuals),
+        calibration=CalibrationFigures(stereo, stereo.reprojection, residuals),
         pixel_fits={"x": rms_maps(width)},
         records=[RecordsView(Verification, flat, maps)],
         warnings=[

@@ -12,6 +12,7 @@ from made_up import cloud, error_map, outlines, pixel_curve
 from PIL import Image
 
 from slviewer.errors import InputError
+from slviewer.records.calibration import Reprojection
 from slviewer.report import maps
 from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up
 from slviewer.report.maps import PixelCurve, pixel_curves
@@ -48,10 +49,8 @@ def test_colours_stay_true_where_they_mean_something() -> None:
 
 def test_figures_can_be_drawn_by_several_threads() -> None:
     done: list[Figure] = []
-    threads = [
-        threading.Thread(target=lambda: done.append(pose_bars({"a": (0.1, 0.2)}, {"camera": 0.1})))
-        for _ in range(2)
-    ]
+    errors = Reprojection("stereo", {"camera": 0.1}, {"a": (0.1, 0.2)})
+    threads = [threading.Thread(target=lambda: done.append(pose_bars(errors))) for _ in range(2)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -151,10 +150,19 @@ def test_reprojection_figures() -> None:
     pixels, residuals = rng.uniform(0, 400, (50, 2)), rng.normal(0, 0.1, (50, 2))
     residuals[3] = np.nan
     figure = residual_arrows("pose_03", pixels, residuals, (640, 480))
-    assert missing_facts(figure.alt, "49 features") == []
+    assert missing_facts(figure.alt, "49 positions") == []
+    assert missing_facts(figure.caption, "noise") == []
     opened(figure)
-    worst = pose_bars({"a": (0.1, 0.2), "b": (0.1, np.nan), "c": (0.3, 0.1)}, {"camera": 0.1})
-    assert missing_facts(worst.caption, "worst", "c") == []
+    swirl = 0.1 * np.column_stack([200 - pixels[:, 1], pixels[:, 0] - 200]) / 200
+    order = np.lexsort((pixels[:, 0], pixels[:, 1] // 60))
+    figure = residual_arrows("pose_03", pixels[order], swirl[order], (640, 480))
+    assert missing_facts(figure.caption, "pattern") == [] and "noise" not in figure.caption
+    worst = pose_bars(
+        Reprojection(
+            "splined", {"camera": 0.1}, {"a": (0.1, 0.2), "b": (0.1, np.nan), "c": (0.3, 0.1)}
+        )
+    )
+    assert missing_facts(worst.caption, "worst", "c", "splined") == []
     square = np.array([[0, 0], [320, 0], [320, 479], [0, 479]], float)
     assert missing_facts(coverage("camera", (640, 480), [square, square[:2]]).alt, "50 %") == []
 

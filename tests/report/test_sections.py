@@ -292,7 +292,8 @@ def test_the_title_page_counts_scans_of_the_part_alone() -> None:
 def test_a_calibration_made_elsewhere() -> None:
     data = session_data(WIDTH)
     assert data.calibration is not None
-    bare = CalibrationFigures(StereoModel.from_rig(data.calibration.stereo.rig))
+    made_elsewhere = StereoModel.from_rig(data.calibration.stereo.rig)
+    bare = CalibrationFigures(made_elsewhere, made_elsewhere.reprojection)
     sections = session_sections(
         dataclasses.replace(data, calibration=bare, records=(), pixel_fits={})
     )

@@ -46,7 +46,7 @@ def calibration(stale: str = "") -> CalibrationView:
     stereo = StereoModel(
         rig, "circles:9x7:20", ("x",), {"stereo": 0.1}, poses, {}, {}, (400.0, 600.0), {}
     )
-    return CalibrationView(stereo, ("stereo",), "stereo", stale)
+    return CalibrationView(stereo, stereo.reprojection, ("stereo",), "stereo", stale)
 
 
 def seen(

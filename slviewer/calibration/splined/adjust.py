@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numba
 import numpy as np
+from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from slviewer.calibration.observe import Observation
@@ -35,6 +36,7 @@ from slviewer.calibration.splined.unknowns import State, board_frame
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import box_middle, shared_rms
 
 MIN_POSES = 3
 MAX_STEPS = 30
@@ -251,15 +253,58 @@ def _sigmas(
 def _fit_statistics(
     names: Sequence[str], residuals: ObservedValues, sigmas: ObservedValues, data: PoseData
 ) -> dict[str, PoseFit]:
-    """Compute the RMS residuals and the trust of each pose, excluded ones included."""
+    """Compute the residuals' RMS and pattern and the trust of each pose, excluded ones included."""
     fresh = robust_weights(*residuals, sigmas)
-    features, samples = (
-        np.where(w > 0, r**2, 0.0).sum(axis=1) for r, w in zip(residuals, fresh, strict=True)
+    squares, used = (
+        data.means(*(values.sum(axis=1) for values in pair))
+        for pair in (
+            [np.where(w > 0, r**2, 0.0) for r, w in zip(residuals, fresh, strict=True)],
+            [0.5 * (w > 0) for w in fresh],
+        )
     )
-    squares = data.means(features, samples)
-    rms = np.sqrt(np.where(squares > 0, squares, np.nan))
-    figures = np.hstack([rms, pose_trust(fresh, sigmas, data)])
+    rms = np.sqrt(np.where(squares > 0, squares, np.nan) / np.maximum(used, 1e-9))
+    patterns = [
+        [shared_rms(part) for part in np.split(np.where(w > 0, r, np.nan), start[1:-1])]
+        for r, w, start in zip(residuals, fresh, (data.feature_from, data.sample_from), strict=True)
+    ]
+    figures = np.hstack([rms, pose_trust(fresh, sigmas, data), np.transpose(patterns)])
     return {name: PoseFit(*row) for name, row in zip(names, figures.tolist(), strict=True)}
+
+
+def pose_residuals(
+    bundle: Bundle, observation: Observation
+) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]] | None:
+    """Return the camera's pixels (n, 2) of a pose's features with their residuals (n, 2) px, and
+    the projector's (m, 2) of its samples with theirs; NaN where they are outliers.
+
+    None for a pose that the adjustment lacks.
+    """
+    samples = observation.samples
+    if observation.name not in bundle.poses or samples is None:
+        return None
+    i, points = bundle.poses.index(observation.name), observation.points
+    if observation.name in bundle.half_turned_poses:
+        points = 2 * box_middle(bundle.points) - points
+    distances, feature = cKDTree(bundle.points[:, :2]).query(points[:, :2])
+    known = distances < 1e-3
+    data = PoseData(
+        np.array([0, np.count_nonzero(known)]),
+        feature[known],
+        np.ascontiguousarray(observation.camera[known]),
+        np.array([0, len(samples.camera)]),
+        samples.camera,
+        samples.projector,
+        bundle.points,
+        board_frame(bundle.points),
+    )
+    state = bundle.state
+    pose = state._replace(R_board=state.R_board[i : i + 1], t_board=state.t_board[i : i + 1])
+    residuals = _residuals(pose, data)
+    weights = robust_weights(*residuals, _sigmas(residuals, bundle.noise, samples.sigma, data))
+    camera, projector = (
+        np.where(w > 0, r, np.nan) for r, w in zip(residuals, weights, strict=True)
+    )
+    return (data.feature_px, camera), (data.projector_px, projector)
 
 
 def _count_poses(

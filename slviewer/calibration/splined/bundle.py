@@ -35,12 +35,15 @@ from slviewer.geometry.rigid import Floats, Floats32, Mask
 @dataclass(frozen=True)
 class PoseFit:
     """Residuals of one pose: RMS px of its features in the camera and of its samples in the
-    projector, without outliers, and the trust in each, 0 ... 1; undisturbed poses reach 0.8."""
+    projector, without outliers, the trust in each, 0 ... 1, which undisturbed poses have of 0.8 or
+    more, and the RMS px of the pattern in each, as `shared_rms` returns it."""
 
     camera_rms_px: float
     projector_rms_px: float
     camera_trust: float
     projector_trust: float
+    camera_pattern_px: float = 0.0
+    projector_pattern_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

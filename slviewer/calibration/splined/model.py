@@ -217,6 +217,7 @@ class SplinedModel:
         local = [rms(device.coefficients[:, 1:-1, 1:-1]) for device in self.rig[:2]]
         lit = [float(np.mean(cells)) for cells in bundle.illuminated]
         height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
+        used = [fit for name, fit in bundle.fits.items() if name not in bundle.excluded]
         return SplinedFit(
             steps=bundle.steps,
             residuals_over_noise=dict(zip(AXES, noise.ratio, strict=True)),
@@ -228,6 +229,13 @@ class SplinedModel:
             sigma_volume_mm=self.sigma_volume,
             weights={
                 name: (fit.camera_trust, fit.projector_trust) for name, fit in bundle.fits.items()
+            },
+            pose_rms_px={
+                name: (fit.camera_rms_px, fit.projector_rms_px) for name, fit in bundle.fits.items()
+            },
+            pattern_px={
+                "camera": rms([fit.camera_pattern_px for fit in used]),
+                "projector": rms([fit.projector_pattern_px for fit in used]),
             },
             excluded=dict(bundle.excluded),
             turned=tuple(bundle.half_turned_poses),

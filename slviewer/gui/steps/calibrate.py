@@ -129,7 +129,7 @@ class CalibratePanel(StepPanel):
             self._draw_models(calibration, snapshot.is_busy)
         states = ("used", "excluded", "unused")
         names = [pose.name for pose in session.poses if pose.state in states]
-        rms = {name: max(rms) for name, rms in calibration.stereo.pose_rms_px.items()}
+        rms = {name: max(rms) for name, rms in calibration.reprojection.pose_rms_px.items()}
         self._pose.offer_names(names, max(rms, key=rms.__getitem__, default=""))
         clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
         self._over.offer({"none": ""} | clouds)
@@ -146,6 +146,8 @@ class CalibratePanel(StepPanel):
         """Show the verdict, and the poses that it names."""
         session, calibration = self.session, self.session.calibration
         if verdict:
+            if calibration and session.verdict_of_calibration:
+                verdict = calibration.reprojection.judge(verdict, calibration.best)
             self._verdict.set(verdict_html(verdict, session.verdict_of_calibration, calibration))
         elif calibration and calibration.stereo.board:
             self._verdict.write("No verdict on this calibration: calibrate again for one.")
@@ -153,7 +155,7 @@ class CalibratePanel(StepPanel):
             self._verdict.set("")
         self._anyway.handle.visible = bool(calibration and calibration.rejected)
         self._anyway.update(bool(calibration and calibration.is_pinned))
-        known = calibration.stereo.pose_rms_px if calibration else {}
+        known = calibration.reprojection.pose_rms_px if calibration else {}
         names = [name for name in named_poses(verdict, calibration) if name in known]
         if names:
             self._named.options = tuple(names[:_MOST_NAMED])
@@ -198,7 +200,7 @@ class CalibratePanel(StepPanel):
             request(
                 self._bars.set,
                 made,
-                lambda: pose_bars(stereo.pose_rms_px, stereo.reprojection_rms_px, width=PLOT_PX),
+                lambda: pose_bars(calibration.reprojection, width=PLOT_PX),
             )
         self._draw_pose(calibration)
         self._draw_boards(calibration)
@@ -229,7 +231,7 @@ class CalibratePanel(StepPanel):
             return
         excluded = pose.state == "excluded"
         self._exclude.label = f"Include {name} again" if excluded else f"Exclude {name}"
-        rms = calibration.stereo.pose_rms_px.get(name)
+        rms, model = calibration.reprojection.pose_rms_px.get(name), calibration.reprojection.model
         if rms is None:
             why = f": {pose.why}" if pose.why else ""
             self._pose_note.write(
@@ -238,7 +240,7 @@ class CalibratePanel(StepPanel):
             self.painter.cancel(self._arrows.set)
             self._arrows.set(None)
             return
-        text = f"{name}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
+        text = f"{name}, {calibration.label}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
         if calibration.splined and name in calibration.splined.weights:
             camera, projector = calibration.splined.weights[name]
             weights = f"features {100 * camera:.0f} %, phase {100 * projector:.0f} %"
@@ -256,7 +258,7 @@ class CalibratePanel(StepPanel):
             if residuals is None:
                 return None
             return residual_arrows(
-                f"{name}, {device}", *residuals[device], getattr(rig, device).size
+                f"{name}, {device}, {model}", *residuals[device], getattr(rig, device).size
             )
 
         self.painter.request(self._arrows.set, (made, name, device), arrows)
@@ -275,7 +277,7 @@ class CalibratePanel(StepPanel):
         if covered or not stereo.board:
             return
         outline = Board.parse(stereo.board).outline()
-        worst_px = {name: max(rms) for name, rms in stereo.pose_rms_px.items()}
+        worst_px = {name: max(px) for name, px in calibration.reprojection.pose_rms_px.items()}
         usual = np.sqrt(np.mean(np.square([*worst_px.values()] or [1.0])))
         for pose in poses:
             if pose.T_camera_board is not None and pose.name in worst_px:
@@ -350,7 +352,13 @@ class CalibratePanel(StepPanel):
 def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:
     """Return a key that changes with the calibration, for its pictures."""
     rig = calibration.stereo.rig
-    return calibration.models, rig.camera.K.tobytes(), rig.projector.K.tobytes(), rig.t.tobytes()
+    return (
+        calibration.models,
+        calibration.best,
+        rig.camera.K.tobytes(),
+        rig.projector.K.tobytes(),
+        rig.t.tobytes(),
+    )
 
 
 def _summary(calibration: CalibrationView) -> Html:
@@ -358,9 +366,10 @@ def _summary(calibration: CalibrationView) -> Html:
     stereo = calibration.stereo
     properties: dict[str, object] = {
         f"Reprojection RMS, {device}": coloured(f"{rms:.3f} px", "plain", bold=True)
-        for device, rms in stereo.reprojection_rms_px.items()
-        if device in DEVICES
+        for device, rms in calibration.reprojection.rms_px.items()
     }
+    if properties:
+        properties["of the model"] = calibration.label
     depths = stereo.depth_range_mm
     properties |= {
         "Poses used": f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.excluded)}",
@@ -386,6 +395,8 @@ def verdict_html(
     `of_calibration`: whether the judged attempt made the current calibration.
     """
     tone, level, meaning = _LEVELS[verdict.level]
+    if verdict.level == "good" and of_calibration and calibration:
+        meaning += describe_residuals(calibration)
     lines = [
         f'<div style="display:flex;gap:0.5em;align-items:flex-start">{_draw_icon(tone)}'
         f"<div>{coloured(level, tone, bold=True)}: {to_html(meaning)}</div></div>"
@@ -396,6 +407,16 @@ def verdict_html(
         text = to_html(f"This attempt gave no calibration{end}")
         lines.append(f'<div style="margin-top:0.5em">{text}</div>')
     return alert(Html("".join(lines)), tone)
+
+
+def describe_residuals(calibration: CalibrationView) -> str:
+    """Describe what the residuals that are drawn say of a good calibration, as a sentence."""
+    of = calibration.reprojection
+    if not of.pattern_px:
+        return ""
+    if not of.patterns:
+        return f" The residuals of {of.model} are noise."
+    return f" The residuals drawn are those of {calibration.label} pixel by pixel."
 
 
 def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) -> tuple[str, ...]:

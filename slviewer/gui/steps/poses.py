@@ -280,7 +280,8 @@ class PosesPanel(StepPanel):
         ]
         if pose.rms_px:
             camera, projector = pose.rms_px
-            rms = f"Reprojection RMS: camera {camera:.3f} px, projector {projector:.3f} px"
+            model = self.session.calibration.label if self.session.calibration else ""
+            rms = f"Reprojection RMS, {model}: camera {camera:.3f} px, projector {projector:.3f} px"
             lines.append(to_html(rms))
         if pose.T_camera_board is not None:
             about = "" if pose.state == "used" else "about "
