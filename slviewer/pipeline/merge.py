@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.geometry.rigid import move_points, rotation_angle
+from slviewer.pipeline.cloud_record import list_outside_depths
 from slviewer.pipeline.feedback import Warn, ignore_warnings, part, stage
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
 from slviewer.pipeline.operation import Found, Job, operation
@@ -138,10 +139,9 @@ class MergeSettings:
         if len(self.names) < 2:
             raise UsageError(f"only {self.reference} was named: name the scans to merge with it")
         if self.out is not None and Path(self.out).suffix.lower() != ".ply":
-            name = Path(self.out).name
             raise UsageError(
-                f"merged points are written as .ply, not as {name}: a mesh goes into other"
-                " files too"
+                f"merged points are written as .ply, not as {Path(self.out).name}: a mesh goes"
+                " into other files too"
             )
         if self.angle is not None and self.start != "turntable":
             raise UsageError(
@@ -185,8 +185,7 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     place at the end."""
     store, names, warn = job.store, settings.names, job.warn
     if settings.out is not None:
-        # or it fails now, not after minutes
-        Path(settings.out).parent.mkdir(parents=True, exist_ok=True)
+        Path(settings.out).parent.mkdir(parents=True, exist_ok=True)  # or it fails now
     table_deg = _list_table_angles(store, settings)
     starts = _initial_alignments(job, settings, table_deg)
     check_accepted(store, settings.accept_rejected)
@@ -212,6 +211,7 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     job.progress(0.9, "writing")
     used = describe_calibration(store, model, fused.names)
     used["inputs"] |= inputs
+    used["depths"] = list_outside_depths(store, clouds, warn)
     record = _make_record(registered, fused, restrictions=list(restrictions), **used)
     with _write_merge(store, settings, fused, record) as found:
         yield MergedScans(alignment, fused, clouds, found)

@@ -16,6 +16,7 @@ from slviewer.evaluation.fit import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
+from slviewer.pipeline.cloud_record import cloud_record, masked_share
 from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
@@ -29,8 +30,8 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.operation import Found, Job, operation, plain_settings
-from slviewer.pipeline.scale import describe_calibration, scale_cloud, scale_factor
+from slviewer.pipeline.operation import Found, Job, operation
+from slviewer.pipeline.scale import scale_cloud, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.pipeline.stored_records import is_up_to_date, load_record, numbered_names, placed_file
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
@@ -201,47 +202,6 @@ def _write_files(
         yield path
 
 
-def cloud_record(
-    store: Session,
-    settings: ReconstructSettings,
-    model: Model,
-    cloud: Cloud,
-    phase: PhaseMap,
-    region: np.ndarray | None,
-) -> Found[Reconstruction]:
-    """Return what is stored of a capture's cloud, before edits and region; ``region`` (h, w) bool:
-    of the board."""
-    near, far = np.percentile(cloud.points[..., 2][cloud.mask], [1, 99])
-    arrays = {
-        "points": cloud.points,
-        "sigma_z": cloud.sigma_z,
-        "phase": phase.phase,
-        "modulation": phase.modulation,
-        "texture": cloud.texture,
-        "sigma_calibration": cloud.sigma_calibration,
-        "sigma_edges": cloud.sigma_edges,
-    }
-    if cloud.misfit is not None:
-        arrays |= vars(cloud.misfit)
-    known = {name: array for name, array in arrays.items() if array is not None}
-    left = cloud.sigma_calibration
-    record = Reconstruction(
-        operation="reconstruct",
-        settings=plain_settings(settings),
-        axis=cloud.axis,
-        points=int(np.count_nonzero(cloud.mask)),
-        depth_mm=(float(near), float(far)),
-        noise_mm=float(np.median(cloud.sigma_z[cloud.mask])),
-        sigma_calibration_mm=None if left is None else float(np.median(left[cloud.mask])),
-        raised=model.residuals_over_noise(cloud.axis) if isinstance(model, SplinedModel) else 1.0,
-        misfit_px=None if cloud.misfit is None else float(cloud.misfit.excess_px.max()),
-        masked=masked_share(model, phase, region),
-        frame=frame_of(store, cloud.model),
-        **describe_calibration(store, cloud.model, [settings.capture]),
-    )
-    return Found(settings.capture, record, known)
-
-
 def segment_board(
     store: Session, shot: Capture, texture: np.ndarray, warn: Warn
 ) -> np.ndarray | None:
@@ -256,19 +216,6 @@ def segment_board(
         warn(f"{shot.name}: {error}")
         return None
     return board_mask(board, detection, texture.shape[:2])
-
-
-def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None) -> float | None:
-    """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are
-    masked, because they look through parts of camera or projector that no target pose illuminated;
-    None for models that mask none.
-    """
-    if not isinstance(model, SplinedModel):
-        return None
-    every = np.isfinite(model.points(phase, supported=False)[..., 2])
-    if region is not None:
-        every &= region
-    return float(1 - model.support(phase)[every].mean()) if every.any() else 0.0
 
 
 @dataclass(frozen=True)

@@ -52,11 +52,11 @@ class Reprojection(msgspec.Struct, frozen=True):
         if model != self.model or not self.patterns or "residuals" in verdict.causes:
             return verdict
         parts = " and ".join(
-            f"{px:.2f} of {self.rms_px[device]:.2f} px in the {device}"
+            f"{px:.3f} of {self.rms_px[device]:.3f} px in the {device}"
             for device, px in self.patterns.items()
         )
         remedy = (
-            "use the splined model, which follows what the lenses lack"
+            "use the splined model, which follows the local distortion of the lenses"
             if model == "stereo"
             else "see that board, light and rig do not change while a pose is captured"
         )

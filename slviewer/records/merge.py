@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
+from slviewer.records.reconstruction import DepthCheck
 from slviewer.records.record import Count, Matrix4, Record, Share, Vector
 from slviewer.records.table import Cell, Column, Table
 
@@ -116,8 +117,9 @@ class Merge(Record, frozen=True, kw_only=True):
     ``pairs``: every scan but the reference on it; ``registered``: the pairs that the merge was made
     from; ``loops`` that these close, the worst first; ``dropped``: pairs that the others
     contradict. ``static_points`` stand still while the object moves; ``left_out``: {scan: {why:
-    points}}; ``shared``: share of the ``points`` seen by several scans. ``ply``: the file in the
-    session's exports; ``scale``, ``restrictions``: correction of scale, edits and region in words.
+    points}}; ``shared``: share of the ``points`` seen by several scans. ``depths``: of scans that
+    are partly outside the calibrated depths. ``ply``: the file in the session's exports; ``scale``,
+    ``restrictions``: correction of scale, edits and region in words.
     """
 
     kind: ClassVar[str] = "merge"
@@ -139,6 +141,12 @@ class Merge(Record, frozen=True, kw_only=True):
     left_out: dict[str, dict[str, Count]] = {}
     shared: float | None = None
     restrictions: list[str] = []
+    depths: dict[str, DepthCheck] = {}
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the scans are within the calibrated depths."""
+        return not self.depths
 
     @classmethod
     def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -166,7 +174,10 @@ class Merge(Record, frozen=True, kw_only=True):
             f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %"
             for n, p in self.pairs.items()
         )
-        return f"merged on {self.reference}: {'; '.join(pairs)}"
+        merged = f"merged on {self.reference}: {'; '.join(pairs)}"
+        if not self.depths:
+            return merged
+        return f"{merged}; outside the calibrated depths: {', '.join(self.depths)}"
 
     def figures(self) -> dict[str, float]:
         """Return the RMS and overlap of each registered pair, and the number of points."""
@@ -228,6 +239,7 @@ class Merge(Record, frozen=True, kw_only=True):
             for each in self.registered
             if each.rival_mm is not None
         ]
+        notes += [f"{scan}: {each.text()}." for scan, each in self.depths.items()]
         notes += [f"Excluded: {each.why}." for each in self.dropped]
         notes += [
             f"Not registered: {each.scan} onto {each.onto}: {each.why}." for each in self.refused

@@ -5,12 +5,53 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from slviewer.records.record import Count, Record
+from slviewer.records.record import Count, Record, Share
 from slviewer.records.table import Column, Table
 
 REPORTED_RAISE = 1.2
 """Times its predicted noise that a calibration's residual is, from which raising sigma is
 reported."""
+
+
+REPORTED_OUTSIDE = 0.02
+"""Share of the points outside the calibrated depths, from which on it is reported."""
+
+
+class DepthCheck(msgspec.Struct, frozen=True):
+    """How a cloud lies to the depths, near and far end in mm, between which the board was when the
+    rig was calibrated: the share of its points ``outside``, their ``nearest`` and ``farthest``
+    depth, and the median of their ``sigma``; ``is_whole``: with what the calibration leaves
+    uncertain there, else that is not known, and sigma is of noise alone."""
+
+    calibrated_mm: tuple[float, float]
+    outside: Share
+    nearest_mm: float | None = None
+    farthest_mm: float | None = None
+    sigma_mm: float | None = None
+    is_whole: bool = False
+
+    @property
+    def is_good(self) -> bool:
+        """Whether hardly any point is outside."""
+        return self.outside <= REPORTED_OUTSIDE
+
+    def text(self) -> str:
+        """Describe the points outside, and what their sigma is worth; empty where there are hardly
+        any."""
+        if self.is_good or self.sigma_mm is None:
+            return ""
+        near, far = self.calibrated_mm
+        worth = (
+            "which includes what the calibration leaves uncertain there"
+            if self.is_whole
+            else "of noise alone: how wrong the calibration is there is not known"
+        )
+        return (
+            f"{100 * self.outside:.0f} % of the points are outside the calibrated depths,"
+            f" {near:.0f} to {far:.0f} mm, at {self.nearest_mm:.0f} to {self.farthest_mm:.0f} mm:"
+            f" their sigma is {self.sigma_mm:.3f} mm, {worth}. Move the part to the calibrated"
+            " depths, or add target poses there"
+        )
 
 
 class ImportedPoints(msgspec.Struct, frozen=True):
@@ -38,6 +79,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     miss each other beyond what is predicted, None where they do not; ``masked``: share of the
     pixels, 0 to 1, outside the calibrated region, None for models that mask none; ``scale``: the
     correction of scale, in words; ``frame``: the one that the points are in, in words.
+    ``depths``: the share of the points outside the calibrated depths, and what their sigma is
+    worth; None where no such depths are known.
     ``imported``: of points from a file, in rows that mean nothing; their arrays are ``points``,
     ``normals`` (h, w, 3), ``sigma_z`` along these, and ``texture`` where they have colours.
     """
@@ -55,6 +98,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     masked: float | None = None
     scale: str = ""
     frame: str = ""
+    depths: DepthCheck | None = None
     imported: ImportedPoints | None = None
 
     @classmethod
@@ -66,9 +110,17 @@ class Reconstruction(Record, frozen=True, kw_only=True):
         settings = {"capture": captures[0], "model": meta.get("model"), "axis": meta.get("axis")}
         return {**meta, "operation": "reconstruct", "settings": settings}
 
+    @property
+    def is_good(self) -> bool:
+        """Whether the points are within the calibrated depths, as far as these are known."""
+        return self.depths is None or self.depths.is_good
+
     def summary(self) -> str:
-        """Return how many points there are."""
-        return f"{self.points:,} points"
+        """Return how many points there are, and how many are outside the calibrated depths."""
+        if self.depths is None or self.depths.is_good:
+            return f"{self.points:,} points"
+        share = 100 * self.depths.outside
+        return f"{self.points:,} points, {share:.0f} % of them outside the calibrated depths"
 
     def figures(self) -> dict[str, float]:
         """Return the number of points and the median noise of their depth."""
@@ -87,6 +139,9 @@ class Reconstruction(Record, frozen=True, kw_only=True):
                 "points": each.points,
                 Column("nearest", "mm", digits=0): each.depth_mm and each.depth_mm[0],
                 Column("farthest", "mm", digits=0): each.depth_mm and each.depth_mm[1],
+                Column("outside", "%", digits=0): (
+                    100 * each.depths.outside if each.depths and each.depths.outside else None
+                ),
                 Column("noise", "mm"): each.noise_mm,
                 Column("calibration", "mm", digits=4, detail=True): each.sigma_calibration_mm,
                 Column("masked", "%", digits=1, detail=True): (
@@ -109,9 +164,15 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             for name, each in found.items()
             if each.misfit_px is not None
         ]
+        raised += [
+            f"{name}: {text}."
+            for name, each in found.items()
+            if each.depths and (text := each.depths.text())
+        ]
         frames = {each.frame: None for each in found.values() if each.frame}
         note = (
-            "Nearest and farthest: 1 % and 99 % of the depths. Noise and calibration: medians of"
+            "Nearest and farthest: 1 % and 99 % of the depths. Outside: share of the points outside"
+            " the depths of the target poses. Noise and calibration: medians of"
             " the standard deviations of depth, by the capture's noise and by what the calibration"
             " leaves uncertain."
         )

@@ -64,7 +64,8 @@ class LiveModel:
     """Reconstructs short captures: a sequence, a calibration, and the scale applied to it. For one
     thread at a time.
 
-    ``calibrated``: the rig whose sizes the frames must have.
+    ``calibrated``: the rig whose sizes the frames must have; ``depths_mm``: nearest and farthest
+    depth that it was calibrated at, None where that is not known.
     """
 
     sequence: PatternSequence
@@ -72,6 +73,7 @@ class LiveModel:
     model: Model
     factor: float = 1.0
     calibrated: StereoRig | None = None
+    depths_mm: tuple[float, float] | None = None
     _fast: OnePass | None = field(init=False, repr=False, default=None)
     _before: PassResult | None = field(init=False, repr=False, default=None)
 
@@ -106,6 +108,16 @@ class LiveModel:
             points *= np.float32(self.factor)
         return points, np.array(to_eight_bits(frames[-1], self.sequence.full_scale))
 
+    def share_outside(self, points: np.ndarray) -> float:
+        """Return the share of points (h, w, 3) mm, of every fourth row and column, outside the
+        calibrated depths; 0 where these are not known, or there are no points."""
+        z = points[::4, ::4, 2]
+        z = z[np.isfinite(z)]
+        if self.depths_mm is None or not len(z):
+            return 0.0
+        near, far = (self.factor * mm for mm in self.depths_mm)
+        return float(np.mean((z < near) | (z > far)))
+
 
 class LiveScan(Service):
     """A live scan, from its start to its end.
@@ -131,7 +143,7 @@ class LiveScan(Service):
         # time and latency, s, of the latest clouds
         self._made: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
         self._sent: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
-        self._points, self._number, self._reported = 0, 0, 0.0
+        self._points, self._outside, self._number, self._reported = 0, 0.0, 0, 0.0
         self._model: LiveModel | None = None  # of the calibration of this key, checked at that time
         self._key: tuple[object, ...] = ()
         self._loaded = 0.0
@@ -162,7 +174,10 @@ class LiveScan(Service):
             rates = _compute_rate(self._made, now), _compute_rate(self._sent, now)
             late_s = [late for _, late in self._sent]
             return LiveView(
-                *rates, 1e3 * float(np.median(late_s)) if late_s else None, self._points
+                *rates,
+                1e3 * float(np.median(late_s)) if late_s else None,
+                self._points,
+                self._outside,
             )
 
     def _serve(self) -> None:
@@ -171,7 +186,8 @@ class LiveScan(Service):
         released = time.monotonic()
         while (shot := self.stream.wait_next()) is not None:
             try:
-                points, texture = self._load_model().cloud(shot.frames)
+                live = self._load_model()
+                points, texture = live.cloud(shot.frames)
             except Exception as error:
                 self._notices.add_failure("Live", error)
                 self._acquisition.stop_stream()
@@ -181,6 +197,7 @@ class LiveScan(Service):
                 self._made.append((now, now - shot.begun))
                 self._number += 1
                 self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
+                self._outside = live.share_outside(points)
             if not self.is_running:
                 return
             self._publish(LiveCloud(self._number, points, texture, shot.begun))
@@ -215,8 +232,10 @@ class LiveScan(Service):
                 f"the {name} calibration has no axis {self.axis}, which a live scan needs: capture"
                 " a scan"
             )
-        self._key, rig = key, load_stereo(store).rig
-        self._model = LiveModel(self.stream.sequence, self.axis, model, factor, rig)
+        self._key, stereo = key, load_stereo(store)
+        self._model = LiveModel(
+            self.stream.sequence, self.axis, model, factor, stereo.rig, stereo.depth_range_mm
+        )
         return self._model
 
 

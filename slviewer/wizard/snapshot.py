@@ -327,13 +327,15 @@ class SessionView:
 class LiveView:
     """A live scan: clouds computed per second, 0 before the first, and of those shown;
     `latency_ms`: the median from the start of a cloud's capture until it is sent to the screens,
-    None before one was; `points` of the latest cloud.
+    None before one was; `points` of the latest cloud, and the share of them that is `outside` the
+    calibrated depths.
     """
 
     clouds_per_s: float
     shown_per_s: float
     latency_ms: float | None
     points: int
+    outside: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

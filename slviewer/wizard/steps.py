@@ -243,6 +243,13 @@ def _scan(now: Snapshot) -> Outlook:
         for scan in now.content.scans
         if scan.cloud == "stale"
     ]
+    outside = [
+        scan.label
+        for scan in now.content.scans
+        if scan.cloud == "fresh" and scan.purpose == "scan" and not scan.figures.is_good
+    ]
+    if outside:
+        stale.append(f"{join_names(outside, 3)}: outside the calibrated depths.")
     problems = [*_device_problems(now), *_stale_calibration(now), *stale]
     return _no_calibration(now), scans > 0, instruction, problems
 

@@ -37,12 +37,25 @@ def test_calibrate_shows_and_judges_the_residuals_of_the_model_in_use(shown: Ope
     click(page, "4. Calibrate")
     expect(page.get_by_text("The residuals of splined are noise.")).to_be_visible()
     expect(page.get_by_text("of each target pose by the splined model")).to_be_visible()
-    expect(page.get_by_text(re.compile(r"camera, splined: measured .* px: noise"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"camera, splined: measured .*px: noise"))).to_be_visible()
     choose(page, "Model", "stereo")
     expect(page.get_by_text("The residuals of the stereo model are a pattern")).to_be_visible()
     expect(page.get_by_text("no problems detected")).to_have_count(0)
     expect(page.get_by_text("of each target pose by the stereo model")).to_be_visible()
     expect(
-        page.get_by_text(re.compile(r"camera, stereo: measured .* px: a pattern"))
+        page.get_by_text(re.compile(r"camera, stereo: measured .*px: a pattern"))
     ).to_be_visible()
+    assert shown.errors == []
+
+
+def test_scan_outside_the_calibrated_depths_says_so(shown: Opened) -> None:
+    page = shown.page
+    click(page, "6. Scan")
+    choose(page, "Scan", "plane_01")
+    click(page, "Reconstruct")
+    expect(
+        page.get_by_text("of the points are outside the calibrated depths").first
+    ).to_be_visible()
+    expect(page.get_by_text("which includes what the calibration leaves uncertain")).to_be_visible()
+    expect(page.get_by_text("done", exact=True)).to_have_count(0)
     assert shown.errors == []

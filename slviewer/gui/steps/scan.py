@@ -37,10 +37,11 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
+from slviewer.records.reconstruction import REPORTED_OUTSIDE
 from slviewer.records.verification import Verification
 from slviewer.simulation.concave import CONCAVE
 from slviewer.wizard.result_views import ScanCloud, used_points, whole_cloud
-from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView
+from slviewer.wizard.snapshot import BoardSeen, LiveView, PreviewView, ScanView, SessionView
 
 ONE, ALIGNED = "one", "aligned"
 LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capture"
@@ -68,6 +69,7 @@ class ScanPanel(StepPanel):
         self._screen = LiveScreen(self.context)
         operator.subscribe_live(self._screen.offer)
         self._picture = LiveImage(gui)
+        self._depths = Text(gui)
         self._capture = self.button(
             "Capture scan", lambda: operator.capture_scan(self._name.value), "camera", None
         )
@@ -166,8 +168,15 @@ class ScanPanel(StepPanel):
         self._draw_scan(next(scan for scan in scans if scan.name == self._scan.value))
 
     def draw_preview(self, preview: PreviewView) -> None:
-        """Show the live image."""
+        """Show the live image, and whether what is known of it is at the calibrated depths."""
         self._picture.draw(preview)
+        self._depths.write(*describe_depths(self._calibrated_mm, preview.board))
+
+    @property
+    def _calibrated_mm(self) -> tuple[float, float] | None:
+        """The nearest and the farthest calibrated depth; None where they are not known."""
+        calibration = self.session.calibration
+        return None if calibration is None else calibration.stereo.depth_range_mm
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers; hiding stops a live scan."""
@@ -185,7 +194,9 @@ class ScanPanel(StepPanel):
         button.icon = viser.IconName("player-play" if live is None else "player-stop")
         button.disabled = live is None and not ready
         save.visible, save.disabled = live is not None, live is None or not live.clouds_per_s
-        self._live_status.set("" if live is None else live_html(live, self._screen.points))
+        self._live_status.set(
+            "" if live is None else live_html(live, self._screen.points, self._calibrated_mm)
+        )
         if live:
             self._clear_cloud()
         else:
@@ -347,8 +358,27 @@ def aligned_html(aligned: AlignedScans) -> Html:
     return format_patches(SEEN_TITLES, SEEN_COLOURS) + paragraph(text)
 
 
-def live_html(live: LiveView, shown: int) -> Html:
-    """Describe rate and latency of the live clouds."""
+def describe_depths(
+    calibrated_mm: tuple[float, float] | None, board: BoardSeen | None
+) -> tuple[str, Tone]:
+    """Return the calibrated depths as a sentence, with that of the board in view, and a warning's
+    tone where it is outside of them."""
+    if calibrated_mm is None:
+        return "", "dim"
+    near, far = calibrated_mm
+    text = f"Calibrated depths: {near:.0f} to {far:.0f} mm from the camera"
+    if board is None or board.T_camera_board is None:
+        return f"{text}: place the part there.", "dim"
+    depth = float(board.T_camera_board[2, 3])
+    if near <= depth <= far:
+        return f"{text}; the board in view is at {depth:.0f} mm.", "dim"
+    where = "nearer" if depth < near else "farther"
+    return f"{text}; the board in view is {where}, at {depth:.0f} mm: move it.", "warning"
+
+
+def live_html(live: LiveView, shown: int, calibrated_mm: tuple[float, float] | None) -> Html:
+    """Describe rate and latency of the live clouds, and warn where they are not at the calibrated
+    depths."""
     if not live.clouds_per_s:
         return note("Waiting for the first cloud …")
     latency = "" if live.latency_ms is None else f", latency {live.latency_ms:.0f} ms"
@@ -360,7 +390,12 @@ def live_html(live: LiveView, shown: int) -> Html:
         text = "No points: check that the object is illuminated and within the calibrated depths."
         return paragraph(Html(html)) + alert(text, "warning")
     text = f"{live.points:,} points, {shown:,} shown; moving parts are masked."
-    return paragraph(Html(html)) + note(f"{text} Nothing is saved yet.")
+    drawn = paragraph(Html(html)) + note(f"{text} Nothing is saved yet.")
+    if calibrated_mm is not None and live.outside > REPORTED_OUTSIDE:
+        share, (near, far) = 100 * live.outside, calibrated_mm
+        text = f"{share:.0f} % of the points are outside the calibrated depths"
+        drawn += alert(f"{text}, {near:.0f} to {far:.0f} mm: move the part.", "warning")
+    return drawn
 
 
 def point_html(cloud: ScanCloud, u: int, v: int) -> Html:
@@ -397,6 +432,8 @@ def scan_html(scan: ScanView) -> Html:
     html = properties_table(display_name(scan.name, scan.label), properties)
     if masked is not None and masked > MUCH_MASKED:
         html += alert("Much is masked: capture target poses at the object's place.", "warning")
+    if figures.depths and not figures.depths.is_good:
+        html += alert(f"{figures.depths.text()}.", "warning")
     if figures.scale:
         html += paragraph(f"{figures.scale[:1].upper()}{figures.scale[1:]}.")
     if scan.cloud == "stale":

@@ -1,0 +1,106 @@
+"""What is stored of a capture's cloud: its figures, what the calibration did not see of it, and how
+it lies to the calibrated depths."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.fringe.phase import PhaseMap
+from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.models import Model, frame_of, load_stereo
+from slviewer.pipeline.operation import Found, plain_settings
+from slviewer.pipeline.scale import describe_calibration, scale_factor
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.reconstruction import DepthCheck, Reconstruction
+from slviewer.session.names import join_names
+from slviewer.session.store import Session
+
+
+def cloud_record(
+    store: Session,
+    settings: Any,
+    model: Model,
+    cloud: Cloud,
+    phase: PhaseMap,
+    region: np.ndarray | None,
+) -> Found[Reconstruction]:
+    """Return what is stored of a capture's cloud, before edits and region; ``settings``: of the
+    operation `reconstruct`; ``region`` (h, w) bool: of the board."""
+    near, far = np.percentile(cloud.points[..., 2][cloud.mask], [1, 99])
+    arrays = {
+        "points": cloud.points,
+        "sigma_z": cloud.sigma_z,
+        "phase": phase.phase,
+        "modulation": phase.modulation,
+        "texture": cloud.texture,
+        "sigma_calibration": cloud.sigma_calibration,
+        "sigma_edges": cloud.sigma_edges,
+    }
+    if cloud.misfit is not None:
+        arrays |= vars(cloud.misfit)
+    known = {name: array for name, array in arrays.items() if array is not None}
+    left = cloud.sigma_calibration
+    record = Reconstruction(
+        operation="reconstruct",
+        settings=plain_settings(settings),
+        axis=cloud.axis,
+        points=int(np.count_nonzero(cloud.mask)),
+        depth_mm=(float(near), float(far)),
+        noise_mm=float(np.median(cloud.sigma_z[cloud.mask])),
+        sigma_calibration_mm=None if left is None else float(np.median(left[cloud.mask])),
+        raised=model.residuals_over_noise(cloud.axis) if isinstance(model, SplinedModel) else 1.0,
+        misfit_px=None if cloud.misfit is None else float(cloud.misfit.excess_px.max()),
+        masked=masked_share(model, phase, region),
+        depths=check_depths(store, cloud),
+        frame=frame_of(store, cloud.model),
+        **describe_calibration(store, cloud.model, [settings.capture]),
+    )
+    return Found(settings.capture, record, known)
+
+
+def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None) -> float | None:
+    """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are
+    masked, because they look through parts of camera or projector that no target pose illuminated;
+    None for models that mask none.
+    """
+    if not isinstance(model, SplinedModel):
+        return None
+    every = np.isfinite(model.points(phase, supported=False)[..., 2])
+    if region is not None:
+        every &= region
+    return float(1 - model.support(phase)[every].mean()) if every.any() else 0.0
+
+
+def check_depths(store: Session, cloud: Cloud) -> DepthCheck | None:
+    """Return how a cloud by one of the session's models lies to the depths that this was calibrated
+    at; None for imported points, and a calibration that states no depths."""
+    calibrated = load_stereo(store).depth_range_mm if cloud.model else None
+    if calibrated is None or not cloud.mask.any():
+        return None
+    factor = scale_factor(store, cloud.model)
+    near, far = (factor * mm for mm in calibrated)
+    z = cloud.points[..., 2]
+    outside = (z < near) | (z > far)
+    share = float(np.mean(outside[cloud.mask]))
+    if not share:
+        return DepthCheck((near, far), 0.0)
+    nearest, farthest = (float(np.percentile(z[outside], percent)) for percent in (1, 99))
+    sigma_mm = float(np.nanmedian(cloud.sigma[outside]))
+    is_whole = cloud.sigma_calibration is not None
+    return DepthCheck((near, far), share, nearest, farthest, sigma_mm, is_whole)
+
+
+def list_outside_depths(
+    store: Session, clouds: Mapping[str, Cloud], warn: Warn
+) -> dict[str, DepthCheck]:
+    """Return the checks of the clouds that are partly outside the calibrated depths, and warn of
+    them."""
+    checks = {name: check_depths(store, cloud) for name, cloud in clouds.items()}
+    found = {name: each for name, each in checks.items() if each and not each.is_good}
+    if found:
+        worst = max(found.values(), key=lambda each: each.outside)
+        others = " (of the worst)" if len(found) > 1 else ""
+        warn(f"{join_names(list(found), 3)}: {worst.text()}{others}")
+    return found
