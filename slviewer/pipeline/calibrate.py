@@ -394,7 +394,7 @@ def _fit_models(
         warn(diagnosed.warning)
     doubts = [finding for finding in verdict.findings if finding.severity == "doubtful"]
     stated = {name for each in doubts for name in each.poses if name in each.sentence}
-    _warn_of_excluded(stereo, stated.union(excluded), warn)
+    _warn_of_excluded(stereo.excluded, stated.union(excluded), warn)
     few = next((finding for finding in doubts if finding.cause == "too-few-poses"), None)
     models = settings.models or MODELS
     pixelwise, splined, share = None, None, 0.0
@@ -413,8 +413,7 @@ def _fit_models(
             splined = calibrate_splined(
                 observations, stereo, fitting, cells_across=settings.cells_across
             )
-            for name, why in splined.bundle.excluded.items():
-                warn(f"{name} is excluded from the splined model: it {why}")
+            _warn_of_excluded(splined.bundle.excluded, (), warn, " from the splined model: it")
             verdict = judge_splined(verdict, splined.bundle.noise, splined.bundle.camera)
     for finding in verdict.findings:
         if finding.severity != "note":
@@ -424,11 +423,13 @@ def _fit_models(
     return CalibrationResult(stereo, pixelwise, splined, verdict)
 
 
-def _warn_of_excluded(stereo: StereoModel, stated: Container[str], warn: Warn) -> None:
-    """Warn of poses that the stereo calibration excluded, but for those already ``stated``."""
-    for name, why in stereo.excluded.items():
+def _warn_of_excluded(
+    excluded: Mapping[str, str], stated: Container[str], warn: Warn, model: str = ":"
+) -> None:
+    """Warn of poses that a calibration excluded, {name: why}, but for those already ``stated``."""
+    for name, why in excluded.items():
         if name not in stated:
-            warn(f"{name} is excluded: {why}")
+            warn(f"{name} is excluded{model} {why}")
 
 
 @contextmanager
