@@ -87,11 +87,46 @@ class SceneLayer:
     """Draws objects into one layer of viser's scene; an object replaces that of the same name."""
 
     def __init__(
-        self, api: viser.SceneApi, name: str, submit: Callable[[Callable[[], Any]], None]
+        self,
+        api: viser.SceneApi,
+        name: str,
+        submit: Callable[[Callable[[], Any]], None],
+        scene: "ViewerScene",
     ) -> None:
-        self.name, self._api, self._submit = name, api, submit
+        self.name, self._api, self._submit, self._scene = name, api, submit, scene
         self._root: Any = api.add_frame(f"/{name}", show_axes=False)
         self._nodes: dict[str, Any] = {}
+        self._titles: dict[str, str] = {}
+        self._hidden: set[str] = set()
+
+    def list_objects(self) -> dict[str, tuple[str, bool]]:
+        """Return {name: title, whether it is shown} of the objects, none while the layer is
+        hidden."""
+        if not self._root.visible:
+            return {}
+        titles, hidden = self._titles, self._hidden
+        return {name: (titles.get(name, name), name not in hidden) for name in self._nodes}
+
+    def toggle(self, name: str) -> None:
+        """Show a hidden object again, or hide it, also when it is drawn anew."""
+        self._hidden ^= {name}
+        if node := self._nodes.get(name):
+            node.visible = name not in self._hidden
+        self._scene.on_change()
+
+    def resize_points(self, factor: float) -> None:
+        """Draw the points of clouds larger by a factor."""
+        for node in self._nodes.values():
+            if isinstance(node, viser.PointCloudHandle):
+                node.point_size *= factor
+
+    def _add(self, name: str, node: Any, title: str = "") -> None:
+        """Add an object's node, with a title for the list of objects."""
+        self._nodes[name] = node
+        self._titles[name] = title or name
+        if name in self._hidden:
+            node.visible = False
+        self._scene.on_change()
 
     def hover_html(self, name: str) -> str:
         """Return what makes the page show, while the pointer moves, which point of an object a
@@ -101,12 +136,14 @@ class SceneLayer:
     def show(self, visible: bool) -> None:
         """Show or hide everything in the layer, now and when it is filled later."""
         self._root.visible = visible
+        self._scene.on_change()
 
     def remove(self, *names: str) -> None:
         """Remove those of these objects that exist."""
         for name in names:
             if node := self._nodes.pop(name, None):
                 node.remove()
+                self._scene.on_change()
 
     def clear(self) -> None:
         """Remove all objects."""
@@ -124,7 +161,7 @@ class SceneLayer:
         mm."""
         width, height = size
         wxyz, position = _split_pose(T_camera_device)
-        self._nodes[name] = self._api.add_camera_frustum(
+        frustum = self._api.add_camera_frustum(
             self._make_path(name),
             fov=float(2 * np.arctan2(height / 2, K[1, 1])),
             # of the viewing angles, not of the pixels: a projector's may be far from square
@@ -136,6 +173,7 @@ class SceneLayer:
             wxyz=wxyz,
             position=position,
         )
+        self._add(name, frustum)
 
     def board(
         self,
@@ -223,7 +261,9 @@ class SceneLayer:
         """
         shown, colours = thin(points, colours, limit)
         if len(shown):
-            self._nodes[name] = add_points(self._api, self._make_path(name), shown, colours)
+            node = add_points(self._api, self._make_path(name), shown, colours)
+            node.point_size *= self._scene.point_scale
+            self._add(name, node)
         else:
             self.remove(name)
         return len(shown)
@@ -238,14 +278,15 @@ class SceneLayer:
     ) -> None:
         """Draw a point (3,) mm as a ball with a label."""
         path = self._make_path(name)
-        self._nodes[name] = self._api.add_icosphere(
+        ball = self._api.add_icosphere(
             path, radius=radius_mm, color=colour, position=np.asarray(point, float)
         )
+        self._add(name, ball, text)
         self._api.add_label(f"{path}/words", text, anchor="bottom-left")
 
     def ball(self, name: str, centre: np.ndarray, radius_mm: float) -> None:
         """Draw a transparent ball around centre (3,) mm."""
-        self._nodes[name] = self._api.add_icosphere(
+        ball = self._api.add_icosphere(
             self._make_path(name),
             radius=radius_mm,
             color=GHOST,
@@ -254,6 +295,7 @@ class SceneLayer:
             cast_shadow=False,
             receive_shadow=False,
         )
+        self._add(name, ball)
 
     def lines(
         self,
@@ -268,7 +310,8 @@ class SceneLayer:
         mm."""
         path = self._make_path(name)
         wxyz, position = _split_pose(np.eye(4) if T is None else T)
-        self._nodes[name] = self._api.add_frame(path, show_axes=False, wxyz=wxyz, position=position)
+        frame = self._api.add_frame(path, show_axes=False, wxyz=wxyz, position=position)
+        self._add(name, frame, label[0] if label else "")
         if len(segments):
             self._api.add_line_segments(
                 f"{path}/lines",
@@ -297,6 +340,10 @@ class ViewerScene:
         self, server: viser.ViserServer, submit: Callable[[Callable[[], Any]], None]
     ) -> None:
         self._api, self._submit = server.scene, submit
+        self.layers: list[SceneLayer] = []
+        self.point_scale = 1.0
+        self.on_change: Callable[[], None] = lambda: None
+        """Called when objects were added, removed, shown or hidden."""
         self._drawn_shape = Text(server.gui)  # read by the page's script
         api = server.scene
         api.set_up_direction("-y")
@@ -315,7 +362,15 @@ class ViewerScene:
 
     def layer(self, name: str) -> SceneLayer:
         """Return a new layer."""
-        return SceneLayer(self._api, name, self._submit)
+        self.layers.append(SceneLayer(self._api, name, self._submit, self))
+        return self.layers[-1]
+
+    def scale_points(self, scale: float) -> None:
+        """Draw the points of all clouds, now and later, so many times as large as their
+        distance."""
+        for layer in self.layers:
+            layer.resize_points(scale / self.point_scale)
+        self.point_scale = scale
 
     def on_click(self, do: Callable[[Click], None] | None) -> None:
         """Call `do(click)` for each click into the scene; None: stop."""

@@ -23,6 +23,7 @@ from slviewer.gui.panel import NO_SESSION, ControlGroup, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.start import START, StartPanel
 from slviewer.gui.undo_controls import UndoControls
+from slviewer.gui.view_tree import ViewTree
 from slviewer.gui.widgets import (
     NOTICES,
     STEPS_PAGE,
@@ -167,6 +168,8 @@ class Shell(ControlGroup):
             )
         with panel.add_tab("Messages"):
             self._latest = Text(gui)
+        with panel.add_tab("View"):
+            ViewTree(self.context)
 
     # drawing
 

@@ -1,0 +1,46 @@
+"""The list of what is in the 3D view, without a browser."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import viser
+
+from slviewer.gui.scene import ViewerScene
+from slviewer.server.secure import SafeServer, Serving, serve
+
+
+@pytest.fixture
+def server() -> Iterator[SafeServer]:
+    server = serve(Serving(port=0))
+    yield server
+    server.stop()
+
+
+def test_hidden_objects_stay_hidden_and_points_keep_their_size(server: SafeServer) -> None:
+    scene, changes = ViewerScene(server.viser, lambda do: do()), list[int]()
+    scene.on_change = lambda: changes.append(1)
+    layer, other = scene.layer("scan"), scene.layer("merge")
+    points = np.random.default_rng(0).random((500, 3)).astype(np.float32)
+
+    def draw() -> viser.PointCloudHandle:
+        layer.cloud("cloud", points, (1, 2, 3))
+        node = server.viser.scene.get_handle_by_name("/scan/cloud")
+        assert isinstance(node, viser.PointCloudHandle)
+        return node
+
+    size = draw().point_size
+    layer.lines("m1", np.zeros((1, 2, 3)), (1, 2, 3), label=("distance 1", np.zeros(3)))
+    assert layer.list_objects() == {"cloud": ("cloud", True), "m1": ("distance 1", True)}
+    layer.toggle("cloud")
+    assert not draw().visible and layer.list_objects()["cloud"] == ("cloud", False)
+    layer.toggle("cloud")
+    assert draw().visible
+    scene.scale_points(2.0)
+    assert draw().point_size == pytest.approx(2 * size)
+    scene.scale_points(0.5)
+    assert draw().point_size == pytest.approx(size / 2)
+    changes.clear()
+    layer.remove("m1")
+    layer.show(False)
+    assert layer.list_objects() == other.list_objects() == {} and len(changes) == 2
