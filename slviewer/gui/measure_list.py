@@ -223,7 +223,7 @@ class MeasurementList(PanelPart):
                 self.react(slider.on_update)
             self._values = Text(gui)
             self._details = Text(gui)
-            self._new_name: Any = gui.add_text("New name", "")
+            self._new_name: Any = gui.add_text("New name", "", hint="Of the result")
             self.button("Rename", self._request_rename, "pencil")
             self.button(
                 "Delete result",

@@ -17,6 +17,7 @@ import viser
 from slviewer.devices.browser import PageChannels, PageRole
 from slviewer.devices.page_channel import PageState
 from slviewer.errors import InputError, hide_passwords
+from slviewer.gui.hints import HINTS
 from slviewer.gui.scene import Colour, ViewerScene, Viewpoints
 from slviewer.gui.widgets import NOTICES, link, paragraph
 from slviewer.server.secure import SafeServer
@@ -380,7 +381,7 @@ class ControlGroup:
         `icon`: the name of one of Tabler's icons.
         """
         name = None if icon is None else viser.IconName(icon)
-        handle = self._gui.add_button(label, icon=name, color=color, hint=hint)
+        handle = self._gui.add_button(label, icon=name, color=color, hint=hint or HINTS.get(label))
         self.react(handle.on_click, do, at_once=at_once)
         if color is None:
             self.context.main_buttons.append(handle)
@@ -397,7 +398,7 @@ class ControlGroup:
 
     def button_group(self, label: str, names: Sequence[str], do: Callable[[str], Any]) -> Any:
         """Add buttons side by side; `do(name)` is called with the name of the pressed one."""
-        handle: Any = self._gui.add_button_group(label, tuple(names))
+        handle: Any = self._gui.add_button_group(label, tuple(names), hint=HINTS.get(label))
         self.react(handle.on_click, lambda: do(handle.value))
         return handle
 
@@ -406,7 +407,11 @@ class ControlGroup:
     ) -> viser.GuiUploadButtonHandle:
         """Add a button that calls `do(name, content)` with an uploaded file."""
         handle = self._gui.add_upload_button(
-            label, icon=viser.Icon.UPLOAD, color="gray", mime_type=file_types
+            label,
+            icon=viser.Icon.UPLOAD,
+            color="gray",
+            mime_type=file_types,
+            hint=HINTS.get(label),
         )
         self.react(handle.on_upload, lambda: do(handle.value.name, handle.value.content))
         return handle
@@ -421,13 +426,14 @@ class ControlGroup:
         hint: str | None = None,
     ) -> Any:
         """Add a number within `low` ... `high`, a whole one if `value` is."""
+        hint = hint or HINTS.get(label)
         handle: Any = self._gui.add_number(label, value, min=low, max=high, step=step, hint=hint)
         self.react(handle.on_update)
         return handle
 
     def checkbox(self, label: str, hint: str | None = None, value: bool = False) -> Any:
         """Add a checkbox."""
-        handle = self._gui.add_checkbox(label, value, hint=hint)
+        handle = self._gui.add_checkbox(label, value, hint=hint or HINTS.get(label))
         self.react(handle.on_update)
         return handle
 
@@ -439,7 +445,7 @@ class ControlGroup:
         do: Callable[[], Any] | None = None,
     ) -> Any:
         """Add a dropdown of texts; `do()` is called when a user chooses another one."""
-        handle: Any = self._gui.add_dropdown(label, tuple(options), hint=hint)
+        handle: Any = self._gui.add_dropdown(label, tuple(options), hint=hint or HINTS.get(label))
         self.react(handle.on_update, do)
         return handle
 

@@ -353,11 +353,15 @@ class RegionInputs(PanelPart):
                 hint="Box around this scan",
             )
             self._handles = self.checkbox("Handles", "Arrows move the box in 3D, rings turn it")
-            self._centre = gui.add_vector3("Centre (mm)", (0.0, 0.0, 0.0), step=0.1)
-            self._size = gui.add_vector3(
-                "Size (mm)", (1.0, 1.0, 1.0), min=(0.1, 0.1, 0.1), step=0.1
+            self._centre = gui.add_vector3(
+                "Centre (mm)", (0.0, 0.0, 0.0), step=0.1, hint="Of the region, x, y and z"
             )
-            self._turn = gui.add_vector3("Turn (°)", (0.0, 0.0, 0.0), step=0.1)
+            self._size = gui.add_vector3(
+                "Size (mm)", (1.0, 1.0, 1.0), min=(0.1, 0.1, 0.1), step=0.1, hint="Of the region"
+            )
+            self._turn = gui.add_vector3(
+                "Turn (°)", (0.0, 0.0, 0.0), step=0.1, hint="About x, y and z"
+            )
         self._numbers = [
             self.setting(each, self._set_from_numbers)
             for each in (self._centre, self._size, self._turn)

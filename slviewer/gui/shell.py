@@ -120,7 +120,10 @@ class Shell(ControlGroup):
         )
         self._step_buttons = {
             step.key: self.button(
-                f"{number}. {step.title}", partial(self.go, step.key), _ICONS[step.state]
+                f"{number}. {step.title}",
+                partial(self.go, step.key),
+                _ICONS[step.state],
+                hint=f"Shows the step {step.title}",
             )
             for number, step in enumerate(steps, 1)
         }
@@ -452,8 +455,13 @@ def show_links(context: PanelContext, client: viser.ClientHandle | None) -> None
             " projector and camera too. This page continues."
         )
         gui.add_html(str(paragraph(about)))
-        renew = gui.add_button("New links", icon=viser.Icon.REFRESH, color="gray")
-        close = gui.add_button("Close")
+        renew = gui.add_button(
+            "New links",
+            icon=viser.Icon.REFRESH,
+            color="gray",
+            hint="Closes every page that the present links opened",
+        )
+        close = gui.add_button("Close", hint="Closes this dialog")
     renew.on_click(replace)
     close.on_click(lambda _: dialog.close())
 

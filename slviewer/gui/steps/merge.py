@@ -127,7 +127,7 @@ class MergePanel(StepPanel):
                 label = display_name(scan.name, label)
             if scan.name not in self._boxes:
                 with self._scans_folder:
-                    self._boxes[scan.name] = self.checkbox(label, value=True)
+                    self._boxes[scan.name] = self.checkbox(label, "Merge this scan", True)
             self._boxes[scan.name].label = label
 
     def _offer_views(self) -> None:

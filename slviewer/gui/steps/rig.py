@@ -288,7 +288,9 @@ class RigPanel(StepPanel):
         self._picture = LiveImage(gui)
         RigCheck(self)
         self._histogram = Text(gui)
-        self._exposure: Any = gui.add_slider("Exposure, ms", 0.01, 4.0, 0.01, 1.0)
+        self._exposure: Any = gui.add_slider(
+            "Exposure, ms", 0.01, 4.0, 0.01, 1.0, hint="Of each frame; brighter, not saturated"
+        )
         self.react(self._exposure.on_update, self._set_exposure)
         self.button_group("Brightness", ("Darker", "Brighter"), self._step_exposure)
         self._light = self.setting(

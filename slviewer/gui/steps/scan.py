@@ -105,7 +105,7 @@ class ScanPanel(StepPanel):
             self._point = Text(gui)
             self._region = RegionInputs(self)
             self._editing = PointEditing(self, self._redraw, self._show_point)
-            name = gui.add_text("New name", "")
+            name = gui.add_text("New name", "", hint="Of the scan that is shown")
             self.button("Rename scan", lambda: operator.rename(scan.value, name.value), "pencil")
             self.button(
                 "Delete scan", lambda: operator.delete(scan.value), "trash",
