@@ -1,18 +1,23 @@
 """Draw the pictures of the wizard in README and the quick start: an Autopilot run on the simulated
 rig.
 
-    python docs/screenshots.py
+    python docs/screenshots.py [--all FOLDER]
+
+`--all` writes pictures of all steps into FOLDER instead, before, during and after the run, in
+several sizes, light and dark: to be looked at after changes of the page.
 
 Needs Chromium and the packages of the extra `test`; it takes some minutes. Writes
 `assets/readme/wizard.webp`, which is animated, and `docs/images/wizard_*.png`.
 """
 
+import argparse
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from PIL import Image
@@ -37,11 +42,34 @@ PICTURES = {
     "Measure": "wizard_measure",
 }
 """Pictures of the quick start: the last of a step."""
+SIZES = ((1280, 800), (1440, 900), (1920, 1080))
+STEPS = ["Rig", "Target", "Poses", "Calibrate", "Verify", "Scan", "Merge", "Measure", "Export"]
 
 
-def draw_autopilot(page: Page, folder: Path) -> list[tuple[str, Path]]:
+def draw_looks(page: Page, folder: Path, name: str) -> None:
+    """Write pictures of the page as it is now, in all sizes, light and dark."""
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+            time.sleep(1)
+            page.screenshot(path=folder / f"{name}_{width}x{height}_{scheme}.png")
+    page.set_viewport_size(SIZE)  # type: ignore[arg-type]
+
+
+def draw_steps(page: Page, folder: Path, name: str) -> None:
+    """Write pictures of all steps."""
+    for number, step in enumerate(STEPS, 1):
+        page.get_by_role("button", name=f"{number}. {step}").click()
+        time.sleep(6)  # the view moves, and a cloud is loaded
+        draw_looks(page, folder, f"{number}_{step}_{name}")
+
+
+def draw_autopilot(
+    page: Page, folder: Path, on_step: Callable[[str], None] = lambda _: None
+) -> list[tuple[str, Path]]:
     """Run the Autopilot, and return (the step's title, screenshot) at intervals until it has
-    ended."""
+    ended; `on_step` is called once in each step."""
     page.get_by_role("button", name="Autopilot").click()
     page.get_by_role("button", name="Stop autopilot").wait_for()
     shots: list[tuple[str, Path]] = []
@@ -50,6 +78,8 @@ def draw_autopilot(page: Page, folder: Path) -> list[tuple[str, Path]]:
         path, step = folder / f"{len(shots):03d}.png", find_step(page)
         page.screenshot(path=path)
         if step == find_step(page):  # else the picture may show either
+            if step and step not in [known for known, _ in shots]:
+                on_step(step)
             shots.append((step, path))
         if not page.get_by_role("button", name="Stop autopilot").is_visible():
             return shots
@@ -84,6 +114,9 @@ def write_animation(shots: list[Path], path: Path) -> None:
 
 def main() -> None:
     """Start the wizard on loopback, drive it, and write the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--all", type=Path, help="folder for pictures of all steps")
+    everything: Path | None = parser.parse_args().all
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         scans = Path(tempfile.gettempdir(), "scans")  # a name that may be shown
         scans.mkdir()
@@ -112,6 +145,19 @@ def main() -> None:
             ).first.click()
             page.get_by_text("Preparing,").first.wait_for(state="hidden", timeout=1000 * LONGEST_S)
             page.screenshot(path=Path(folder) / "start.png")
+            if everything:
+                everything.mkdir(parents=True, exist_ok=True)
+                draw_steps(page, everything, "before")
+                page.get_by_role("button", name="1. Rig").click()
+                draw_autopilot(
+                    page,
+                    Path(folder),
+                    lambda step: draw_looks(
+                        page, everything, f"{STEPS.index(step) + 1}_{step}_during"
+                    ),
+                )
+                draw_steps(page, everything, "after")
+                return
             shots = draw_autopilot(page, Path(folder))
             browser.close()
         finally:
