@@ -9,6 +9,10 @@ HINTS = MappingProxyType({
     "Continue": "Shows the next step",
     "Open session": "Opens the folder as a session, or starts a new one in it",
     "Restore": "Brings back what was deleted last",
+    "Undo": "Undoes what was done last",
+    "Redo": "Does again what was undone last",
+    "New session": "Starts an empty session in a new folder",
+    " ": "Open it, start another session with its calibration, or move it to the trash",
     # Rig
     "Rig": "Camera and projector; the simulated one needs no devices",
     "Try again": "Opens the devices once more",
@@ -100,6 +104,8 @@ HINTS = MappingProxyType({
     "Content": "Calibration, poses or points to write",
     "Format": "The format of the file",
     "Write calibration": "Writes the file, to download",
+    "Upload logo": "A picture for the title page of the report",
+    "Remove logo": "Leaves the logo out of the report",
     "Write report": "Writes one HTML file with all results, to download",
 })  # fmt: skip
 """{label: hint}; a control with a hint of its own is not among them."""

@@ -54,7 +54,9 @@ class UndoControls(ControlGroup):
         ]
         with client.gui.add_modal("Keys and mouse") as dialog:
             client.gui.add_html(str(table(("Key", ""), [*rows, *_VIEW.items()], ("left", "left"))))
-            client.gui.add_button("Close", color="gray").on_click(lambda _: dialog.close())
+            client.gui.add_button("Close", color="gray", hint="Closes this dialog").on_click(
+                lambda _: dialog.close()
+            )
 
 
 def format_key(key: str, modifier: str | None) -> str:

@@ -18,7 +18,9 @@ class ViewTree(ControlGroup):
     def __init__(self, context: PanelContext) -> None:
         super().__init__(context)
         gui = self._gui
-        self._size: Any = gui.add_slider("Point size", 0.25, 4.0, 0.25, 1.0)
+        self._size: Any = gui.add_slider(
+            "Point size", 0.25, 4.0, 0.25, 1.0, hint="Of all clouds, relative to their spacing"
+        )
         self.react(self._size.on_update, lambda: context.scene.scale_points(self._size.value))
         self._eyes: dict[tuple[str, str], viser.GuiButtonHandle] = {}
         self._is_requested = False
@@ -40,7 +42,12 @@ class ViewTree(ControlGroup):
         for key, (layer, title, visible) in listed.items():
             if key not in self._eyes:
                 with self._folder:
-                    self._eyes[key] = self.button(title, partial(layer.toggle, key[1]), "eye")
+                    self._eyes[key] = self.button(
+                        title,
+                        partial(layer.toggle, key[1]),
+                        "eye",
+                        hint="Shows or hides it in the view",
+                    )
             eye = self._eyes[key]
             if (eye.label, eye.icon) != (title, _EYES[visible]):  # each would be sent
                 eye.label, eye.icon = title, _EYES[visible]

@@ -43,13 +43,13 @@ _UNIT = re.compile(
 """The space between a figure and its unit, in escaped text."""
 
 Tone = Literal["plain", "dim", "info", "good", "warning", "error"]
-TONES = {
+TONES = {  # by `page_style.css`
     "plain": "var(--mantine-color-text)",
     "dim": "var(--mantine-color-dimmed)",
-    "info": "var(--mantine-color-blue-6)",
-    "good": "var(--mantine-color-green-7)",
-    "warning": "var(--mantine-color-orange-7)",
-    "error": "var(--mantine-color-red-7)",
+    "info": "var(--slv-info)",
+    "good": "var(--slv-good)",
+    "warning": "var(--slv-warning)",
+    "error": "var(--slv-error)",
 }
 _BOXES = {
     "plain": "var(--mantine-color-gray-light)",

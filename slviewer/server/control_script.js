@@ -21,8 +21,12 @@
     for (const label of document.querySelectorAll(FOLDER))
       name(label, { role: "button", tabindex: 0, "aria-expanded": !label.querySelector(".tabler-icon-chevron-down") });
     for (const image of document.querySelectorAll(LIVE))
-      name(image, { role: "button", tabindex: 0, "aria-label": "Live image", title: "Click to enlarge or shrink" });
+      name(image, { role: "button", tabindex: 0, "aria-label": "Camera image", title: "Click to enlarge or shrink" });
+    for (const label of document.querySelectorAll("label[for]"))
+      for (const input of label.closest(".mantine-Text-root").parentElement.nextSibling?.querySelectorAll("input, [role=slider]") ?? [])
+        name(input, { "aria-label": label.textContent });
     for (const image of document.querySelectorAll("img:not([alt])")) image.alt = "";
+    for (const input of document.querySelectorAll("input[type=file]:not([aria-label])")) input.ariaLabel = "File";
     for (const close of document.querySelectorAll(".mantine-Notification-closeButton"))
       name(close, { "aria-label": "Dismiss" });
   };

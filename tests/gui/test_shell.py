@@ -108,7 +108,7 @@ def test_view_keeps_most_of_the_page_in_the_theme_of_the_system(opened: Opened) 
 def test_live_image_is_enlarged_by_click_and_by_key(opened: Opened) -> None:
     page = opened.page
     click(page, "1. Rig")
-    image = button(page, "Live image")
+    image = button(page, "Camera image")
     image.wait_for()
 
     def width() -> float:
