@@ -45,8 +45,10 @@ class UndoControls(ControlGroup):
         for key in self._redo_keys:
             key.label, key.disabled = self._redo.label, not redo
 
-    def _show_keys(self, client: viser.ClientHandle) -> None:
+    def _show_keys(self, client: viser.ClientHandle | None) -> None:
         """Show the keys that do something now, and what the mouse does, in one browser."""
+        if client is None:
+            return
         rows = [
             (format_key(str(each.hotkey), each.modifier), each.label)
             for each in self.context.commands

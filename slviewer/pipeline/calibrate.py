@@ -390,19 +390,16 @@ def _fit_models(
         raise rejection_error(verdict, is_saved=False)
     if verdict.level == "rejected":
         return CalibrationResult(stereo, verdict=verdict)
-    if diagnosed.warning:
-        warn(diagnosed.warning)
-    doubts = [finding for finding in verdict.findings if finding.severity == "doubtful"]
-    stated = {name for each in doubts for name in each.poses if name in each.sentence}
-    _warn_of_excluded(stereo.excluded, stated.union(excluded), warn)
-    few = next((finding for finding in doubts if finding.cause == "too-few-poses"), None)
+    _warn_of_doubts(diagnosed, stereo, excluded, warn)
+    few = next((each for each in verdict.findings if each.cause == "too-few-poses"), None)
     models = settings.models or MODELS
     pixelwise, splined, share = None, None, 0.0
     if "pixelwise" in models:
         share = 0.33 if "splined" in models else 1.0
         if few and len(observations) < MIN_POSES and len(models) > 1:
             more = replace(few, sentence=f"{few.sentence}; no pixel-wise model")
-            verdict = Verdict.of(more if each is few else each for each in verdict.findings)
+            others = [each for each in verdict.findings if each is not few]
+            verdict = Verdict.of([more, *others])
         else:
             with _warn_of_failure("pixel-wise", models, warn):
                 fitting = stage(progress, 0.0, share, "pixel-wise fit")
@@ -421,6 +418,17 @@ def _fit_models(
     if verdict.level == "rejected":
         return CalibrationResult(stereo, verdict=verdict)
     return CalibrationResult(stereo, pixelwise, splined, verdict)
+
+
+def _warn_of_doubts(
+    diagnosed: DiagnosedCalibration, stereo: StereoModel, excluded: Iterable[str], warn: Warn
+) -> None:
+    """Warn of what is doubtful, and of poses that are excluded although no finding says so."""
+    if diagnosed.warning:
+        warn(diagnosed.warning)
+    doubts = [each for each in diagnosed.verdict.findings if each.severity == "doubtful"]
+    stated = {name for each in doubts for name in each.poses if name in each.sentence}
+    _warn_of_excluded(stereo.excluded, stated.union(excluded), warn)
 
 
 def _warn_of_excluded(
