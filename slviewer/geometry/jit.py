@@ -21,6 +21,8 @@ from numba.extending import intrinsic
 
 from slviewer.geometry.jit_cache import cache_folder
 
+COMPILED: list[str] = []
+"""Names of the kernels that this process has compiled or loaded, in order, once a signature."""
 _LOCK = threading.Lock()
 _SETTINGS: Any = numba.config
 
@@ -72,7 +74,9 @@ def _compile_once(compile_here: Callable[[Any], Any], path: Path) -> Callable[[A
             with suppress(OSError, NotImplementedError):
                 # of this process, were it forked
                 stack.enter_context(FileLock(path, thread_local=False))
-            return compile_here(signature)
+            compiled = compile_here(signature)
+            COMPILED.append(path.stem)
+            return compiled
 
     return compile_or_load
 

@@ -402,8 +402,8 @@ def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
         stage = job.stage or "starting"
         work.append((f"{job.name}: {stage}{waiting} ({job.seconds:.0f} s)", job.share))
     if snapshot.preparing is not None:
-        text = f"Preparing, {100 * snapshot.preparing:.0f} %: first steps may take longer"
-        work.append((f"{text} until then", snapshot.preparing))
+        text = f"Preparing, {100 * snapshot.preparing:.0f} %: compiling for this computer, once;"
+        work.append((f"{text} the first pose and calibration wait for it", snapshot.preparing))
     return work
 
 

@@ -1,5 +1,6 @@
 """Kernels are compiled in the background at the first start, and never again."""
 
+import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -7,8 +8,15 @@ from pathlib import Path
 import pytest
 from wizard_events import HANG_S
 
+from slviewer.geometry import jit
 from slviewer.wizard import preparation
-from slviewer.wizard.preparation import Preparation, prepared_file
+from slviewer.wizard.preparation import (
+    OTHERS,
+    SECONDS,
+    Preparation,
+    prepared_file,
+    share_compiled,
+)
 
 SCRIPT = "import sys; print(0.0); print(0.5, flush=True); sys.exit({status})"
 
@@ -65,3 +73,18 @@ def test_the_process_ends_with_the_program_that_started_it() -> None:
     assert float(process.stdout.readline()) == 0.0  # it works
     process.stdin.close()
     assert process.wait(HANG_S) == 1
+
+
+def test_progress_grows_with_each_kernel_by_the_time_that_it_takes() -> None:
+    kernels = [*SECONDS, *(f"kernel {i}" for i in range(OTHERS))]
+    shares = [share_compiled(kernels[:n]) for n in range(len(kernels) + 1)]
+    steps = [after - before for before, after in itertools.pairwise(shares)]
+    assert shares[0] == 0 and shares[-1] == 0.99 and min(steps[:-2]) > 0
+    # a slow kernel moves it more than a fast one, and none holds it up for long
+    assert steps[0] == max(steps) and 0.05 < steps[0] < 0.2
+    assert share_compiled([*kernels, "more than known"]) == 0.99
+
+
+def test_compiled_kernels_are_named(tmp_path: Path) -> None:
+    compile_once = jit._compile_once(lambda signature: signature, tmp_path / "coded_rows.lock")
+    assert compile_once("float32") == "float32" and jit.COMPILED[-1] == "coded_rows"
