@@ -229,7 +229,6 @@ def _show_picture(name: str) -> str:
 
 
 SIMILAR_PICTURES = {
-    "arrays": "compare_models.png",
     "live_cloud": "wizard_scan.png",
     "session": "wizard_calibrate.png",
 }
