@@ -223,21 +223,23 @@ def _draw_part(store: Session, known: Collection[str]) -> Iterator[Figure]:
     if merge and merge.reference in scans:
         scans.insert(0, merge.reference)
     surface = None
+    if merge:
+        with suppress(SlviewerError, OSError):  # its file was deleted
+            merged = read_ply(store.exports / merge.ply)
+            words = f"Merged surface of {format_count(len(merge.scans), 'scan')}"
+            surface = draw_surface(words, merged.points, merged.normals)
     for name in scans[:1]:
         label, arrays = clouds[name].label, load_arrays(store, f"{Reconstruction.kind}/{name}")
-        if clouds[name].record.imported is None:
+        if "texture" in arrays and clouds[name].record.imported is None:
             yield draw_photo(label, arrays["texture"], arrays["points"])
+        if surface:
+            continue
         with suppress(InputError):  # all of it was deleted
             cloud = Cloud(arrays["points"], "x", "", arrays["sigma_z"])
             points = restrict_cloud(store, name, cloud, load_region(store)).points
             is_known, facing = np.isfinite(points).all(axis=2), arrays.get("normals")
             facing = normals(points) if facing is None else facing
             surface = draw_surface(f"Surface of {label}", points[is_known], facing[is_known])
-    if merge:
-        with suppress(SlviewerError, OSError):  # its file was deleted
-            merged = read_ply(store.exports / merge.ply)
-            words = f"Merged surface of {format_count(len(merge.scans), 'scan')}"
-            surface = draw_surface(words, merged.points, merged.normals)
     if surface:
         yield surface
 
