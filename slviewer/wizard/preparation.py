@@ -31,6 +31,9 @@ SWITCHED_OFF = "SLVIEWER_NO_PREPARATION"
 COMMAND = [sys.executable, "-m", "slviewer.wizard.preparation"]
 SECONDS = {
     "coded_rows": 18.0,
+    "_list_rows": 4.0,
+    "_fit_paper_level": 4.0,
+    "_fit_plane": 3.0,
     "_add_samples": 5.0,
     "_predict": 4.5,
     "_measure_centroids": 4.0,
@@ -43,6 +46,9 @@ caches of seven installations, on one busy core of a server."""
 OTHERS, OTHER_S = 150, 0.7
 """How many more there are, by name and signature, and the seconds of each."""
 REPORT_S = 0.5
+PATIENCE_S = 3600.0
+"""Of one act: the kernels of the first pose take minutes to compile, beside other work or on a slow
+computer; an act that is given up leaves the others uncompiled."""
 
 
 class Preparation(Service):
@@ -115,7 +121,7 @@ def prepare() -> None:
         ) as folder,
         Operator(Path(folder, "session"), {**RIG, "scale": SCALE}) as operator,
     ):
-        Autopilot(operator, poses=8).run()
+        Autopilot(operator, poses=8, patience_s=PATIENCE_S).run()
 
 
 def share_compiled(kernels: Sequence[str]) -> float:

@@ -1,5 +1,6 @@
 """Kernels are compiled in the background at the first start, and never again."""
 
+import contextlib
 import itertools
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from wizard_events import HANG_S
 
 from slviewer.geometry import jit
 from slviewer.wizard import preparation
+from slviewer.wizard.autopilot import PATIENCE_S
 from slviewer.wizard.preparation import (
     OTHERS,
     SECONDS,
@@ -88,3 +90,22 @@ def test_progress_grows_with_each_kernel_by_the_time_that_it_takes() -> None:
 def test_compiled_kernels_are_named(tmp_path: Path) -> None:
     compile_once = jit._compile_once(lambda signature: signature, tmp_path / "coded_rows.lock")
     assert compile_once("float32") == "float32" and jit.COMPILED[-1] == "coded_rows"
+
+
+def test_preparation_waits_for_kernels_that_take_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+    patience_s: list[float] = []
+
+    class Waiting:
+        def __init__(self, _operator: object, poses: int, patience_s: float = PATIENCE_S) -> None:
+            self._patience_s = patience_s
+
+        def run(self) -> None:
+            patience_s.append(self._patience_s)
+
+    monkeypatch.setattr(preparation, "Autopilot", Waiting)
+    monkeypatch.setattr(preparation, "Operator", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr(preparation, "_exit_with_parent", lambda: None)
+    monkeypatch.setattr(preparation, "_report_share", lambda: None)
+    monkeypatch.setattr(preparation.os, "nice", lambda _: None)
+    preparation.prepare()
+    assert patience_s[0] >= 10 * PATIENCE_S
