@@ -27,6 +27,7 @@ from slviewer.pipeline.stored_records import opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals, normals
 from slviewer.server import viser_internals
+from slviewer.server.connection import quiet_logger
 from slviewer.session.ply import Ply, read_ply
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
@@ -36,6 +37,12 @@ SHOWN_POINTS = 400_000
 """Points that are sent to the browser; a larger cloud is thinned evenly."""
 PAGE_STYLE = b'[data-testid="floating-panel"] { display: none !important; }'
 """Hides viser's own panel, which has nothing to choose."""
+FRAME_SCRIPT = (
+    b"try { localStorage } catch { Object.defineProperty(window, 'localStorage',"
+    b" { value: { getItem: () => null, setItem() {}, removeItem() {} } }) }"
+)
+"""Browsers deny their storage to a frame of another site's page, such as a notebook's, and viser's
+page ends without one."""
 AMBIENT = 0.35
 """Share of the brightness of a point whose surface is seen edge-on."""
 
@@ -126,7 +133,8 @@ def _serve(
     handler: Callable[..., Any], host: str, port: int, *, process_request: Any, **options: Any
 ) -> serve_websockets:
     """Start viser's server with our page, for browsers that were led to it by its own address."""
-    page = viser_internals.client_page().replace(b"<style>", b"<style>" + PAGE_STYLE, 1)
+    start = b"<script>" + FRAME_SCRIPT + b"</script><style>" + PAGE_STYLE
+    page = viser_internals.client_page().replace(b"<style>", start, 1)
 
     def answer(connection: ServerConnection, request: Request) -> Any:
         """Return the page, or viser's answer; a refusal where another site's page requests it."""
@@ -139,6 +147,7 @@ def _serve(
         headers = Headers([("Content-Type", "text/html"), ("Content-Length", str(len(page)))])
         return Response(HTTPStatus.OK, "OK", headers, page)
 
+    options["logger"] = quiet_logger()
     return serve_websockets(handler, host, port, process_request=answer, **options)
 
 
