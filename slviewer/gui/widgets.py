@@ -239,7 +239,9 @@ def thumbnail(jpeg: bytes, width_px: int, alt: str) -> Html:
         return Html(f'<div style="{style}"></div>')
     data = base64.b64encode(jpeg).decode()
     style = f"width:{width_px}px;height:{height}px;object-fit:cover;border-radius:4px;display:block"
-    return Html(f'<img alt="{to_html(alt)}" src="data:image/jpeg;base64,{data}" style="{style}">')
+    source = f"data:image/jpeg;base64,{data}"
+    # enlarged by `image_lens.js`
+    return Html(f'<img alt="{to_html(alt)}" data-zoom="" src="{source}" style="{style}">')
 
 
 def meter(share: float) -> Html:
@@ -425,6 +427,7 @@ class LiveImage(Picture):
     large where `is_large`, until a click changes it."""
 
     is_large = False
+    _camera_px = 0
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._marker = Text(gui)
@@ -432,7 +435,8 @@ class LiveImage(Picture):
 
     def set(self, image: np.ndarray, legend: str = "") -> None:
         """Show an image and its legend."""
-        self._marker.set(f'<div data-live="{"large" if self.is_large else "small"}"></div>')
+        size = "large" if self.is_large else "small"
+        self._marker.set(f'<div data-live="{size}" data-camera-px="{self._camera_px}"></div>')
         ratio = image.shape[0] / image.shape[1]
         below = f'<div data-live-legend style="--ratio:{ratio:.4f}">{legend}</div>'
         super().set(image, below)
@@ -444,7 +448,7 @@ class LiveImage(Picture):
 
     def draw(self, preview: PreviewView) -> None:
         """Show a frame and its exposure."""
-        self.set(draw_preview(preview), legend(preview, exposure_html(preview)))
+        self._show(preview, draw_preview(preview), exposure_html(preview))
 
     def draw_board(
         self,
@@ -459,7 +463,13 @@ class LiveImage(Picture):
         hint = "" if ghost_px is None else "Dashed blue: hold the board here"
         found = board_html(preview, board, is_wanted)
         lines = found, exposure_html(preview), coloured(hint, "info")
-        self.set(draw_preview(preview, board, ghost_px), legend(preview, *lines))
+        self._show(preview, draw_preview(preview, board, ghost_px), *lines)
+
+    def _show(self, preview: PreviewView, picture: np.ndarray, *lines: Html) -> None:
+        """Show the picture of a frame, with lines below; what is drawn states the camera's width
+        to `image_lens.js`."""
+        self._camera_px = round(preview.image.shape[1] / preview.scale)
+        self.set(picture, legend(preview, *lines))
 
 
 def draw_preview(

@@ -45,6 +45,7 @@ PAGE_SCRIPT = b"\n".join(
         "page_script.js",
         "control_script.js",
         "pointer_script.js",
+        "image_lens.js",
         "view_bar.js",
         "point_readout.js",
     )

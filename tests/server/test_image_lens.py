@@ -1,0 +1,42 @@
+"""The lens over the live image states the camera's pixel and the grey level under the pointer."""
+
+import re
+
+from playwright.sync_api import Browser, expect
+
+from slviewer.server.viser_internals import PAGE_SCRIPT
+
+PAGE = """<body style="margin:0"><div><div data-live="small" data-camera-px="1280"></div></div><div
+><img id="live" width="160" height="120" style="display:block"></div>
+<img id="small" data-zoom width="60" height="60" style="object-fit:cover"><img id="plot" width="60">
+<script>%s</script><script>
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [320, 240];
+  const context = canvas.getContext("2d");
+  const fill = (colour, ...box) => { context.fillStyle = colour; context.fillRect(...box); };
+  fill("rgb(30,30,30)", 0, 0, 320, 240);
+  fill("rgb(200,200,200)", 100, 60, 100, 100);
+  fill("rgb(255,0,80)", 240, 60, 40, 40);
+  for (const image of document.images) image.src = canvas.toDataURL();
+</script>"""
+
+
+def test_the_lens_states_pixel_and_grey_level(browser: Browser) -> None:
+    page = browser.new_page()
+    page.set_content(PAGE % PAGE_SCRIPT.decode())
+    lens = page.locator("#image-lens")
+    box = page.locator("#live").bounding_box()
+    assert box is not None
+    for at, words in {
+        # twice the size on the page, and a quarter of the camera's
+        (20, 10): "x 160, y 80 px: grey level about 30 of 255",
+        (60, 50): "x 480, y 400 px: grey level about 200 of 255",
+        (130, 40): "x 1040, y 320 px: covered by a mark",
+    }.items():
+        page.mouse.move(box["x"] + at[0], box["y"] + at[1])
+        expect(lens).to_have_text(words)
+    page.locator("#small").hover()
+    expect(lens).to_have_text(re.compile("^grey level about 200 of 255$"))
+    page.locator("#plot").hover()
+    expect(lens).to_have_count(0)
+    page.close()
