@@ -39,7 +39,9 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.session.atomic import format_bytes
+from slviewer.session.importers.clouds import FORMATS
 from slviewer.wizard.autopilot import Autopilot
+from slviewer.wizard.operator import CALIBRATIONS
 from slviewer.wizard.snapshot import (
     CalibrationView,
     Notice,
@@ -61,6 +63,8 @@ _STEP_COLOURS: dict[str, Literal["green", "gray"]] = {
 }
 """Of the icons, by `page_style.css`; the shown step's button has the accent colour."""
 _STEPS_WITH_RIG = ("rig", "target", "poses", "calibrate")  # in which the devices matter in 3D
+DROPPED = ",".join((".zip", *FORMATS, *CALIBRATIONS))
+"""Files that are imported; the page hands its input for these what is dropped on it."""
 STAGES = {
     "rig": "check-of-the-rig",
     "target": "target-poses",
@@ -132,6 +136,7 @@ class Shell(ControlGroup):
             "Autopilot", self._toggle_autopilot, "player-play", at_once=True
         )
         self._autopilot.visible = False
+        self.upload_button("Import files", self._operator.import_file, DROPPED)
         self._counts = Text(gui)
         self._undo = UndoControls(self.context)
         self._busy = Text(gui)

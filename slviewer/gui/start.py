@@ -44,7 +44,7 @@ class RecentSession(PanelPart):
         start = self._start
         self._actions = {
             "Open": start.open_session,
-            "Duplicate calibration": start.duplicate,
+            "Duplicate": start.duplicate,
             "Delete": start.delete,
         }
         self._buttons = self.button_group(" ", tuple(self._actions), self._request)
@@ -82,6 +82,7 @@ class StartPanel(StepPanel):
         self._name: Any = gui.add_text("Name", "", hint=f"Of a new folder in {sessions_folder()}")
         self.button("New session", self._make_new, "plus", None)
         with gui.add_folder("Recent sessions") as self._recent_folder:
+            Text(gui).write("Duplicate: a new session with the same calibration.", "dim")
             self._rows = [RecentSession(self) for _ in range(MOST_RECENT)]
             self._restore = self.button("Restore", self._restore_last, "arrow-back-up")
         with gui.add_folder("Another folder", expand_by_default=False):

@@ -432,7 +432,7 @@ def _estimate_origins(capture: NewCapture, warn: Warn) -> PatternSequence:
 
 def import_opencv_calibration(
     file: Path | str,
-    session: Path | str,
+    session: SessionLike,
     keys: Keys | None = None,
     *,
     projector: Size | None = None,

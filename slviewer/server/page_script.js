@@ -71,3 +71,74 @@ const buttonHints = new Map();
 // viser writes the address of its WebSocket into the page's own, unless it has no path. Here every page has one, and the
 // address stays as it is.
 history.replaceState = () => {};
+// Files and folders that are dropped on the page are handed to its input for imports; several, folders and images as one zip.
+(() => {
+  const input = 'input[type=file][accept^=".zip,.ply"]';
+  const image = /\.(bmp|jpe?g|pgm|png|tiff?|webp)$/i;
+  const table = Uint32Array.from({ length: 256 }, (_, n) => {
+    for (let k = 0; k < 8; k++) n = n & 1 ? 0xedb88320 ^ (n >>> 1) : n >>> 1;
+    return n;
+  });
+  const checksum = async (file) => {
+    let crc = -1;
+    for (const reader = file.stream().getReader(); ; ) {
+      const { done, value } = await reader.read();
+      if (done) return ~crc >>> 0;
+      for (const byte of value) crc = table[(crc ^ byte) & 255] ^ (crc >>> 8);
+    }
+  };
+  // [bytes, value] ... as a record of a zip
+  const pack = (...fields) => {
+    const view = new DataView(new ArrayBuffer(fields.reduce((sum, [bytes]) => sum + bytes, 0)));
+    let at = 0;
+    for (const [bytes, value] of fields) {
+      bytes === 2 ? view.setUint16(at, value, true) : view.setUint32(at, value, true);
+      at += bytes;
+    }
+    return view.buffer;
+  };
+  const zip = async (files) => {
+    const parts = [], directory = [];
+    let offset = 0;
+    for (const { path, file } of files) {
+      const name = new TextEncoder().encode(path);
+      const sizes = [[4, file.size], [4, file.size], [2, name.length], [2, 0]];
+      const about = [[2, 20], [2, 0x800], [2, 0], [2, 0], [2, 33], [4, await checksum(file)], ...sizes];
+      parts.push(pack([4, 0x04034b50], ...about), name, file);
+      directory.push(pack([4, 0x02014b50], [2, 20], ...about, [2, 0], [2, 0], [2, 0], [4, 0], [4, offset]), name);
+      offset += 30 + name.length + file.size;
+    }
+    const { size } = new Blob(directory), count = files.length;
+    const end = pack([4, 0x06054b50], [2, 0], [2, 0], [2, count], [2, count], [4, size], [4, offset], [2, 0]);
+    return new Blob([...parts, ...directory, end]);
+  };
+  const list = async (entry) => {
+    if (entry.isFile) {
+      const file = await new Promise((done, failed) => entry.file(done, failed));
+      return [{ path: entry.fullPath.slice(1), file }];
+    }
+    const found = [];
+    for (const reader = entry.createReader(); ; ) {
+      const some = await new Promise((done, failed) => reader.readEntries(done, failed));
+      if (!some.length) return found;
+      for (const inner of some) found.push(...(await list(inner)));
+    }
+  };
+  addEventListener("dragover", (event) => {
+    if (event.dataTransfer.types.includes("Files")) event.preventDefault();
+  });
+  addEventListener("drop", async (event) => {
+    const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry()).filter(Boolean);
+    if (!entries.length) return;
+    event.preventDefault();
+    const target = document.querySelector(input);
+    if (!target) return;
+    const found = (await Promise.all(entries.map(list))).flat();
+    const [first] = entries;
+    const single = entries.length === 1 && first.isFile && !image.test(first.name);
+    const given = new DataTransfer();
+    given.items.add(single ? found[0].file : new File([await zip(found)], `${first.name}.zip`));
+    target.files = given.files;
+    target.dispatchEvent(new Event("change", { bubbles: true }));
+  });
+})();

@@ -21,7 +21,13 @@ from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.capture import check_space, depth_axis, save_frames
 from slviewer.pipeline.feedback import Progress, part
-from slviewer.pipeline.import_captures import Role, describe_import, import_captures
+from slviewer.pipeline.import_captures import (
+    Role,
+    describe_import,
+    import_captures,
+    import_opencv_calibration,
+)
+from slviewer.pipeline.import_cloud import import_cloud
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
 from slviewer.pipeline.turn import (
@@ -37,7 +43,8 @@ from slviewer.pipeline.turn import (
 )
 from slviewer.session import atomic
 from slviewer.session.capture import Purpose, TurnStep
-from slviewer.session.importers.archive import unpack, unpacked_size
+from slviewer.session.importers.archive import CLOUD_SUFFIXES, unpack, unpacked_size
+from slviewer.session.importers.clouds import FORMATS
 from slviewer.session.names import new_name, plain_name
 from slviewer.session.reading import expand_user
 from slviewer.wizard.engine import request
@@ -51,6 +58,7 @@ IMPORTING = "Importing"
 BOARD_S = 10.0
 """Age of a detection up to which the board is taken to be in view still: no image is searched while
 something is captured."""
+CALIBRATIONS = (".yml", ".yaml", ".xml", ".json")
 UNPACKED = "import"
 """Name in the session's folder beside which an upload is unpacked: the session clears what a crash
 leaves of it."""
@@ -414,8 +422,8 @@ class Operator(RigRequests, ResultRequests):
         role: Role = "calibration",
         **options: Any,
     ) -> None:
-        """Import the captures in a zip that was uploaded as `name`; images outside of folders
-        become one capture of that name."""
+        """Import the captures and clouds in a zip that was uploaded as `name`; images outside of
+        folders become one capture of that name."""
 
         def work(job: Job) -> str:
             """Unpack the zip into a temporary folder and import it."""
@@ -433,13 +441,59 @@ class Operator(RigRequests, ResultRequests):
                     for warning in warnings:
                         job.warn(warning)
                     origin = {"origin": name, **options}
-                    return self._import(
-                        replace(job, progress=importing), source, layout, role, origin
-                    )
+                    job = replace(job, progress=importing)
+                    return self._import_unpacked(job, source, layout, role, origin)
                 finally:
                     atomic.discard(staged)
 
         self._work(IMPORTING, work, "frames")
+
+    @request(IMPORTING)
+    def import_file(self, name: str, content: bytes) -> None:
+        """Import a file of any known kind: a zip of captures, which become scans once there is a
+        calibration, else target poses; a cloud or mesh as a scan; an OpenCV calibration."""
+        suffix = Path(name).suffix.lower()
+        if suffix == ".zip":
+            role: Role = "scan" if self._publisher.latest.calibration else "calibration"
+            self.import_zip(name, content, role=role)
+            return
+        if suffix not in (*FORMATS, *CALIBRATIONS):
+            raise InputError(
+                f"{name} cannot be imported: drop a folder or a zip of captures, a cloud, a mesh,"
+                " or a calibration of OpenCV"
+            )
+
+        def work(job: Job) -> str:
+            """Write the file where an importer can read it, and import it."""
+            with atomic.staged_folder(job.store.folder / UNPACKED, len(content)) as staged:
+                try:
+                    file = staged / (plain_name(Path(name).stem, "upload") + suffix)
+                    file.write_bytes(content)
+                    if suffix in CALIBRATIONS:
+                        import_opencv_calibration(file, job.store, warn=job.warn)
+                        return f"the calibration of {name} was imported"
+                    made = import_cloud(job.store, [file], progress=job.progress, warn=job.warn)
+                    return made.summary() or f"{name} was imported as a scan"
+                finally:
+                    atomic.discard(staged)
+
+        self._work(IMPORTING, work)
+
+    def _import_unpacked(
+        self, job: Job, source: Path, layout: str, role: Role, options: dict[str, Any]
+    ) -> str:
+        """Import the clouds in an unpacked zip, then its captures; returns sentences about
+        them."""
+        texts = []
+        files = [each for each in sorted(source.rglob("*")) if each.is_file()]
+        clouds = [each for each in files if each.suffix.lower() in CLOUD_SUFFIXES]
+        if clouds:
+            texts.append(import_cloud(job.store, clouds, warn=job.warn).summary())
+        for each in clouds:
+            each.unlink()
+        if len(files) > len(clouds):
+            texts.append(self._import(job, source, layout, role, options))
+        return "; ".join(texts)
 
     def _import(
         self, job: Job, source: Path, layout: str, role: Role, options: dict[str, Any]

@@ -43,7 +43,7 @@ def test_sessions_are_made_deleted_and_restored(
     page, work = opened.page, tmp_path / "slviewer"
     expect(page.get_by_text("0 poses, 0 scans")).to_be_visible()
     expect(page.get_by_text("Not calibrated")).to_be_visible()
-    click(page, "Duplicate calibration")
+    click(page, "Duplicate")
     expect(page.get_by_role("alert").filter(has_text="no calibration").first).to_be_visible()
     click(page, "Delete")
     expect(button(page, "Restore Bracket 12")).to_be_visible()

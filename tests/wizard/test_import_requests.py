@@ -139,3 +139,30 @@ def test_an_imported_calibration_without_sizes_waits_for_captures(
             and view.calibration is not None
             and view.calibration.stereo.baseline_mm == 100
         )
+
+
+@pytest.mark.computes
+def test_a_dropped_file_is_imported_by_its_kind(
+    operator: Operator, source: Path, tmp_path: Path
+) -> None:
+    points = np.random.default_rng(0).normal((0, 0, 500), 20, (500, 3))
+    text = "\n".join(" ".join(map(str, point)) for point in points).encode()
+    K, R = np.array([[400.0, 0, 60], [0, 400.0, 45], [0, 0, 1]]), np.eye(3)
+    rig = {f"{kind}_{of}": K for kind in "KD" for of in ("camera", "projector")}
+    rig |= {"D_camera": np.zeros(5), "D_projector": np.zeros(5), "R": R, "T": 100 * R[0]}
+    write_calibration(tmp_path / "rig.yml", rig)
+    assert not operator.import_file("notes.md", b"x")
+    assert "notes.md" in list_texts(operator, "error")[0]
+    assert operator.import_folder(source / "capture_0", projector="120x90")  # states the size
+    assert operator.import_file("../a part.xyz", text)
+    assert operator.import_file("set.zip", archived(source))
+    view = operator.wait_until_idle(HANG_S).content
+    assert [scan.name for scan in view.scans] == ["a_part"], list_texts(operator, "error")
+    assert [pose.name for pose in view.poses] == ["capture_0", "capture_2"]
+    assert operator.import_file("rig.yml", (tmp_path / "rig.yml").read_bytes())
+    operator.wait_until_idle(HANG_S)
+    # the frames, of no scene, contradict it
+    assert reports(operator, "error", "capture_0", "calibration")
+    assert operator.session is not None
+    left = {each.name for each in operator.session.folder.glob(".*")}
+    assert left <= {".lock", ".lock-holder"}

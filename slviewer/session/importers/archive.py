@@ -12,6 +12,7 @@ from typing import IO
 
 from slviewer.errors import InputError
 from slviewer.session.atomic import format_bytes
+from slviewer.session.importers.clouds import FORMATS
 from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import visible
 from slviewer.session.importers.layouts import layouts
@@ -21,11 +22,12 @@ MOST_BYTES = 20 * 10**9
 """Unpacked; a hundred poses of 50 frames of 4 MB."""
 MOST_FILES = 20_000
 _DRIVE = re.compile("[A-Za-z]:")
-_EXTRACTED_SUFFIXES = IMAGE_SUFFIXES | {".toml"}
+CLOUD_SUFFIXES = frozenset(FORMATS) - {".txt", ".csv"}  # which are rather notes
+_EXTRACTED_SUFFIXES = IMAGE_SUFFIXES | {".toml"} | CLOUD_SUFFIXES
 
 
 def unpacked_size(archive: IO[bytes]) -> int:
-    """Bytes that the images and TOMLs of a zip take. Raises InputError as `unpack` does."""
+    """Bytes that the images, TOMLs and clouds of a zip take. Raises InputError as `unpack` does."""
     with _open_zip(archive) as zipped:
         return sum(info.file_size for info in _select_members(zipped)[0])
 
@@ -33,8 +35,8 @@ def unpacked_size(archive: IO[bytes]) -> int:
 def unpack(
     archive: IO[bytes], folder: Path, progress: Callable[[float], None]
 ) -> tuple[Path, list[str]]:
-    """Write the images and TOMLs of a zip into an empty folder; returns the folder that holds the
-    captures, and a warning that names the files that are none of these.
+    """Write the images, TOMLs and clouds of a zip into an empty folder; returns the folder that
+    holds the captures, and a warning that names the files that are none of these.
 
     Raises InputError for what is not a zip, is damaged or encrypted, takes more than `MOST_BYTES`,
     or names a place outside of itself.
@@ -59,7 +61,7 @@ def unpack(
             done += info.file_size
             progress(done / max(total, 1))
     warnings = (
-        [f"{join_names(others)} in the zip: neither an image nor a TOML, and not used"]
+        [f"{join_names(others)} in the zip: neither an image, a TOML nor a cloud, and not used"]
         if others
         else []
     )
