@@ -27,8 +27,12 @@
         name(input, { "aria-label": label.textContent });
     for (const image of document.querySelectorAll("img:not([alt])")) image.alt = "";
     for (const input of document.querySelectorAll("input[type=file]:not([aria-label])")) input.ariaLabel = "File";
-    for (const close of document.querySelectorAll(".mantine-Notification-closeButton"))
+    for (const close of document.querySelectorAll(".mantine-CloseButton-root"))
       name(close, { "aria-label": "Dismiss" });
+    for (const icon of document.querySelectorAll("button > * > .tabler-icon-list-search"))
+      name(icon.closest("button"), { "aria-label": "Commands" });
+    for (const box of document.querySelectorAll("[style*='overflow-x:auto'], [style*='overflow-y:auto']"))
+      name(box, { tabindex: 0 }); // so that the arrow keys scroll it
   };
   let waiting = 0;
   new MutationObserver(() => (waiting ||= setTimeout(() => ((waiting = 0), complete()), 50))).observe(document, {
