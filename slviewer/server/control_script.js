@@ -23,7 +23,7 @@
     for (const image of document.querySelectorAll(LIVE))
       name(image, { role: "button", tabindex: 0, "aria-label": "Camera image", title: "Click to enlarge or shrink" });
     for (const label of document.querySelectorAll("label[for]"))
-      for (const input of label.closest(".mantine-Text-root").parentElement.nextSibling?.querySelectorAll("input, [role=slider]") ?? [])
+      for (const input of label.closest(".mantine-Text-root")?.parentElement.nextSibling?.querySelectorAll("input, [role=slider]") ?? [])
         name(input, { "aria-label": label.textContent });
     for (const image of document.querySelectorAll("img:not([alt])")) image.alt = "";
     for (const input of document.querySelectorAll("input[type=file]:not([aria-label])")) input.ariaLabel = "File";

@@ -21,7 +21,7 @@
     #view-bar button { font: inherit; color: inherit; padding: 7px 8px; border: 0; cursor: pointer; background: var(--mantine-color-body, #fff); }
     #view-bar button:hover { background: var(--mantine-color-default-hover, #eee); }
     #view-bar button[aria-pressed=true] { background: var(--mantine-primary-color-light, #d0ebff); }
-    [data-legend] { position: fixed; z-index: 5; right: var(--view-right); top: var(--view-top); width: 260px; padding: 6px 10px 2px;
+    [data-legend] { position: fixed; z-index: 5; right: var(--bar-right); top: var(--bar-top); width: 260px; padding: 6px 10px 2px;
       border-radius: 5px; border: 1px solid var(--mantine-color-default-border, #ccc); background: var(--mantine-color-body, #fff); }
     #view-scale { pointer-events: none; }
     #view-scale hr { margin: 3px 0 0; height: 5px; border: solid currentcolor; border-width: 0 2px 2px; }
@@ -136,9 +136,9 @@
       if (key === drawn) return;
       drawn = key;
       const { style } = document.documentElement;
-      style.setProperty("--view-right", `${innerWidth - box.right + 10}px`);
-      style.setProperty("--view-top", `${box.top + 10}px`);
-      Object.assign(bar.style, { right: "var(--view-right)", bottom: `${innerHeight - box.bottom + 10}px` });
+      style.setProperty("--bar-right", `${innerWidth - box.right + 10}px`);
+      style.setProperty("--bar-top", `${box.top + 10}px`);
+      Object.assign(bar.style, { right: "var(--bar-right)", bottom: `${innerHeight - box.bottom + 10}px` });
       Object.assign(scale.style, { left: `${box.left + 14}px`, bottom: `${innerHeight - box.bottom + 14}px` });
       const mmPerPx = (2 * distance * Math.tan((camera.fov * Math.PI) / 360)) / box.height;
       const decade = 10 ** Math.floor(Math.log10(SCALE_PX * mmPerPx));
