@@ -36,7 +36,7 @@ def test_keys_undo_and_redo_what_the_page_names(tmp_path: Path, browser: Browser
         field(page, "Name").fill("some folder")
         page.keyboard.press("Control+z")
         page.keyboard.press("Shift+?")
-        button(page, "Sessions").focus()
+        button(page, "1. Rig").focus()
         page.keyboard.press("Shift+?")
         expect(page.get_by_role("dialog").get_by_text("Ctrl+Z")).to_be_visible()
         expect(page.get_by_role("dialog").get_by_text("Undo: set the region")).to_be_visible()
