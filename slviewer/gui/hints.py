@@ -65,6 +65,7 @@ HINTS = MappingProxyType({
     "Object": "What stands before the simulated rig",
     "Turn, °": "About the vertical axis",
     "Import folder": "Imports the captures of the folder into this session",
+    "Import files": "Imports captures, clouds, meshes or a calibration; or drop them on the page",
     "Upload zip": "Imports the captures of a zip file of your computer",
     # Edit points
     "Select by": "How points are selected in the view",
