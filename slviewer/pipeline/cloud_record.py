@@ -28,28 +28,35 @@ def cloud_record(
 ) -> Found[Reconstruction]:
     """Return what is stored of a capture's cloud, before edits and region; ``settings``: of the
     operation `reconstruct`; ``region`` (h, w) bool: of the board."""
-    near, far = np.percentile(cloud.points[..., 2][cloud.mask], [1, 99])
+    whole, cloud, beyond = cloud, cloud.supported(), cloud.extrapolated
+    mask = cloud.mask
+    near, far = np.percentile(cloud.points[..., 2][mask], [1, 99]) if mask.any() else (0.0, 0.0)
     arrays = {
-        "points": cloud.points,
-        "sigma_z": cloud.sigma_z,
+        "points": whole.points,
+        "sigma_z": whole.sigma_z,
         "phase": phase.phase,
         "modulation": phase.modulation,
-        "texture": cloud.texture,
-        "sigma_calibration": cloud.sigma_calibration,
-        "sigma_edges": cloud.sigma_edges,
+        "texture": whole.texture,
+        "sigma_calibration": whole.sigma_calibration,
+        "sigma_edges": whole.sigma_edges,
     }
     if cloud.misfit is not None:
         arrays |= vars(cloud.misfit)
+    arrays["extrapolated"] = beyond
     known = {name: array for name, array in arrays.items() if array is not None}
     left = cloud.sigma_calibration
     record = Reconstruction(
         operation="reconstruct",
         settings=plain_settings(settings),
         axis=cloud.axis,
-        points=int(np.count_nonzero(cloud.mask)),
-        depth_mm=(float(near), float(far)),
-        noise_mm=float(np.median(cloud.sigma_z[cloud.mask])),
-        sigma_calibration_mm=None if left is None else float(np.median(left[cloud.mask])),
+        points=int(np.count_nonzero(mask)),
+        depth_mm=(float(near), float(far)) if mask.any() else None,
+        noise_mm=_median(cloud.sigma_z[mask]),
+        sigma_calibration_mm=float(np.median(left[mask]))
+        if left is not None and mask.any()
+        else None,
+        extrapolated=0 if beyond is None else int(np.count_nonzero(beyond)),
+        extrapolated_mm=None if beyond is None else _median(whole.sigma[beyond]),
         raised=model.residuals_over_noise(cloud.axis) if isinstance(model, SplinedModel) else 1.0,
         misfit_px=None if cloud.misfit is None else float(cloud.misfit.excess_px.max()),
         masked=masked_share(model, phase, region),
@@ -58,6 +65,11 @@ def cloud_record(
         **describe_calibration(store, cloud.model, [settings.capture]),
     )
     return Found(settings.capture, record, known)
+
+
+def _median(values: np.ndarray) -> float | None:
+    """Return the median of known values; None without any."""
+    return float(np.median(values)) if len(values) else None
 
 
 def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None) -> float | None:

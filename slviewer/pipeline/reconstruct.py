@@ -80,11 +80,13 @@ class ReconstructSettings:
         roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the
             camera's frame (x right, y down, z away), a TOML file, or off; by default the session's.
         accept_rejected: Use the calibration although its verdict rejects it.
+        supported_only: Omit from the files the points that no target pose supports; else they are
+            marked by the property extrapolated.
 
     ``check``: also compare the frames with each other, and warn of those that do not fit.
     """
 
-    UNRECORDED: ClassVar = ("out", "grid", "mesh", "roi", "check")
+    UNRECORDED: ClassVar = ("out", "grid", "mesh", "roi", "check", "supported_only")
     capture: str
     model: ModelName | None = None
     axis: Axis | None = None
@@ -95,6 +97,7 @@ class ReconstructSettings:
     roi: str = ""
     accept_rejected: bool = False
     check: bool = True
+    supported_only: bool = False
 
     def __post_init__(self) -> None:
         for path, suffix in ((self.out, ".ply"), (self.grid, ".npy")):
@@ -136,7 +139,7 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
     clouds = {
         n: capture_cloud(
             store, m, shot, phases, axis=settings.axis, texture=texture, accept_rejected=accepts,
-            warn=warn,
+            warn=warn, extrapolates=not is_pose,
         )
         for n, m in chosen.items()
     }  # fmt: skip
@@ -152,7 +155,8 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
         fit = fit_clouds("plane", clouds, illuminated, region=region, depth_range=depths)
         tables = Verification.tables({capture: fit.record()})
         board = "inside the board's outline:", *map(render_text, tables)
-    mask = cloud.mask if region is None else cloud.mask & region
+    written = cloud.supported() if settings.supported_only else cloud
+    mask = written.mask if region is None else written.mask & region
     if not mask.any():
         raise InputError(
             f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong"
@@ -161,9 +165,11 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
     job.progress(0.8, "writing")
     points = int(np.count_nonzero(mask))
     found = cloud_record(store, settings, chosen[name], clouds[name], phases[cloud.axis], region)
-    with _write_files(store, settings, cloud, mask, (f"calibration {name}", *restrictions)) as path:
+    origin = f"calibration {name}", *restrictions
+    with _write_files(store, settings, written, mask, origin) as path:
         notes = (*restrictions, f"{points:,} points -> {path}", *board)
-        yield ReconstructedCapture(replace(found, files=(path,), notes=notes), cloud, points)
+        found = replace(found, files=(path,), notes=notes)
+        yield ReconstructedCapture(found, cloud.supported(), points)
     job.progress(1.0, "reconstructed")
 
 
@@ -369,9 +375,10 @@ def capture_cloud(
     texture: np.ndarray | None = None,
     accept_rejected: bool = False,
     warn: Warn = ignore_warnings,
+    extrapolates: bool = False,
 ) -> Cloud:
     """Reconstruct the organised cloud of a decoded capture, with the scale of its calibration
-    applied.
+    applied; ``extrapolates`` as in `reconstruct_cloud`.
 
     Raises InputError where capture and calibration do not belong together: by their sizes, or by
     how far the axes of the capture miss each other, which is a warning if ``accept_rejected``.
@@ -385,7 +392,7 @@ def capture_cloud(
     for message in (*lens_warnings(store, capture), *check.warnings):
         warn(message)
     cloud = scale_cloud(
-        reconstruct_cloud(model, phases, axis=axis, texture=texture),
+        reconstruct_cloud(model, phases, axis=axis, texture=texture, extrapolates=extrapolates),
         scale_factor(store, model.name),
     )
     if (misfit := check.misfit) is None:
@@ -483,8 +490,8 @@ def scan_cloud(
     job: Job, name: str, model: str | None = None, accept_rejected: bool = False, roi: str = ""
 ) -> Cloud:
     """A capture's cloud: the stored one where it was imported, or is up to date and of the
-    requested model, else reconstructed; without what was deleted from it, and what lies outside of
-    the region ``roi``, as `resolve_region` reads it.
+    requested model, else reconstructed; without what is extrapolated, what was deleted from it,
+    and what lies outside of the region ``roi``, as `resolve_region` reads it.
     """
     store, stored = job.store, f"clouds/{name}"
     region = resolve_region(store, roi)
@@ -498,7 +505,7 @@ def scan_cloud(
         for message in lens_warnings(store, capture):
             job.warn(message)
         misfit = Misfit.pop_from(arrays)
-        cloud = Cloud(axis=meta["axis"], model=meta["model"], misfit=misfit, **arrays)
+        cloud = Cloud(axis=meta["axis"], model=meta["model"], misfit=misfit, **arrays).supported()
     else:
         fitted, accepts = load_model(store, model), accept_rejected
         *_, cloud = next(reconstruct_captures(job, fitted, [name], accept_rejected=accepts))

@@ -235,8 +235,9 @@ def _draw_part(store: Session, known: Collection[str]) -> Iterator[Figure]:
         if surface:
             continue
         with suppress(InputError):  # all of it was deleted
-            cloud = Cloud(arrays["points"], "x", "", arrays["sigma_z"])
-            points = restrict_cloud(store, name, cloud, load_region(store)).points
+            beyond = arrays.get("extrapolated")
+            cloud = Cloud(arrays["points"], "x", "", arrays["sigma_z"], extrapolated=beyond)
+            points = restrict_cloud(store, name, cloud.supported(), load_region(store)).points
             is_known, facing = np.isfinite(points).all(axis=2), arrays.get("normals")
             facing = normals(points) if facing is None else facing
             surface = draw_surface(f"Surface of {label}", points[is_known], facing[is_known])

@@ -1,6 +1,7 @@
 """A cloud that keeps the camera's grid: neighbours in the image are neighbours on the surface."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +61,12 @@ class Cloud:
     predicted from the capture's noise. ``sigma_calibration``: (h, w) float32 mm of z too, what the
     calibration leaves uncertain, rigid motion apart: the same in every scan; None from a model that
     does not know. ``sigma_edges``: (h, w) float32 mm, what the camera's blur at edges and a
-    ``misfit`` of the axes add, systematic as well; None where nothing does. ``texture``: (h, w)
-    grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's
-    range (10, 12, 14 or 16 bits, whichever holds its brightest pixel). ``normals``: (h, w, 3)
-    float32 of imported points, which lie in rows without being neighbours, in the frame of their
+    ``misfit`` of the axes add, systematic as well; None where nothing does. ``extrapolated``: (h,
+    w) bool, points through parts of camera or projector that no target pose illuminated; their
+    ``sigma_calibration`` says how little they are worth; None where there are none. ``texture``:
+    (h, w) grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the
+    camera's range (10, 12, 14 or 16 bits, whichever holds its brightest pixel). ``normals``: (h, w,
+    3) float32 of imported points, which lie in rows without being neighbours, in the frame of their
     file; their ``model`` is "", and ``sigma_z`` along these normals.
     """
 
@@ -76,6 +79,7 @@ class Cloud:
     sigma_edges: Map | None = None
     misfit: Misfit | None = None
     normals: Points | None = None
+    extrapolated: Mask | None = None
 
     def __post_init__(self) -> None:
         for name in ("points", "sigma_z", "sigma_calibration", "sigma_edges", "normals"):
@@ -95,6 +99,19 @@ class Cloud:
                 )
         if self.texture is not None:
             vars(self)["texture"] = _convert_texture(self.texture, shape)
+
+    def supported(self) -> Self:
+        """Return the cloud without its extrapolated points."""
+        if (dropped := self.extrapolated) is None:
+            return self
+        maps = {"sigma_z", "sigma_calibration", "sigma_edges"}
+        known = {name: values for name in maps if (values := getattr(self, name)) is not None}
+        changes: dict[str, Any] = {
+            name: np.where(dropped, np.float32(np.nan), values) for name, values in known.items()
+        }
+        return replace(
+            self, points=keep_pixels(self.points, ~dropped), extrapolated=None, **changes
+        )
 
     @property
     def mask(self) -> Mask:
@@ -128,12 +145,15 @@ class Cloud:
     def sigmas(self, chosen: Mask) -> dict[str, np.ndarray]:
         """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them:
         ``sigma_noise``, where the model knows it ``sigma_calibration``, and with that or a misfit
-        ``sigma``, all together; mm of z."""
+        ``sigma``, all together; mm of z. Where there are such points, ``extrapolated`` is 1 of
+        these and 0 of the others."""
         scalars = {"sigma_noise": self.sigma_z[chosen]}
         if self.sigma_calibration is not None:
             scalars["sigma_calibration"] = self.sigma_calibration[chosen]
         if self.sigma_calibration is not None or self.misfit is not None:
             scalars["sigma"] = self.sigma[chosen]
+        if self.extrapolated is not None:
+            scalars["extrapolated"] = self.extrapolated[chosen].astype(np.float32)
         return scalars
 
     @property

@@ -16,7 +16,7 @@ from slviewer.reconstruction.cloud import Cloud, Map, Points
 EDGE_SIGMAS = 10.0
 """Standard deviations of noise, beyond which the error that blur makes at an edge masks a pixel;
 smaller ones are part of its uncertainty."""
-Measured = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+Measured = tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]
 
 JUMP = 0.01
 """A neighbour this much nearer or deeper (share of the depth) belongs to another surface."""
@@ -53,11 +53,25 @@ class KnowsErrors(Protocol):
         calibration."""
 
 
+@runtime_checkable
+class KnowsSupport(Protocol):
+    """A calibration that knows which pixels look through parts of camera and projector that target
+    poses illuminated."""
+
+    def points(self, phase: PhaseMap, supported: bool = True) -> Points:
+        """As `Model`; unless ``supported``, those of other pixels too."""
+
+    def support(self, phase: PhaseMap) -> np.ndarray:
+        """(h, w) bool: the measured pixels that target poses support."""
+
+
 def reconstruct_cloud(
     model: Model,
     phases: Mapping[Axis, PhaseMap],
     axis: Axis | None = None,
     texture: np.ndarray | None = None,
+    *,
+    extrapolates: bool = False,
 ) -> Cloud:
     """Reconstruct the organised cloud of a capture: points, predicted sigmas and texture on the
     camera's grid.
@@ -65,7 +79,8 @@ def reconstruct_cloud(
     ``phases``: the capture's absolute phase maps by axis. ``axis``: the one that depth is taken
     from; None selects the one with the smaller median predicted sigma_z over the pixels that both
     measure, or, where there are none, the one that measures more pixels. ``texture``: (h, w) or (h,
-    w, 3), uint8 or uint16.
+    w, 3), uint8 or uint16. ``extrapolates``: also points that no target pose supports, marked as
+    such; the others are the same.
 
     Raises InputError where the capture or the model lacks the axis.
     """
@@ -86,13 +101,16 @@ def reconstruct_cloud(
             f" {_join_axes(model.axes)}: capture along an axis that is calibrated, or calibrate"
             " with the captured one."
         )
-    measured = {each: _measure(model, phases[each]) for each in axes}
+    measured = {each: _measure(model, phases[each], extrapolates) for each in axes}
     axis = _select_axis(measured)
-    points, sigma_z, edges = measured[axis]
+    points, sigma_z, edges, extrapolated = measured[axis]
     sigma_calibration = (
         model.sigma_calibration(axis, points) if isinstance(model, KnowsErrors) else None
     )
-    return Cloud(points, axis, model.name, sigma_z, texture, sigma_calibration, edges)
+    return Cloud(
+        points, axis, model.name, sigma_z, texture, sigma_calibration, edges,
+        extrapolated=extrapolated,
+    )  # fmt: skip
 
 
 def normals(points: Points, reach: int = 2) -> Points:
@@ -114,18 +132,23 @@ def cloud_normals(cloud: Cloud) -> Points:
     return normals(cloud.points) if cloud.normals is None else cloud.normals
 
 
-def _measure(model: Model, phase: PhaseMap) -> Measured:
+def _measure(model: Model, phase: PhaseMap, extrapolates: bool) -> Measured:
     """Points (h, w, 3) mm, NaN where the camera's blur spoils the phase at an edge; the standard
     deviation (h, w) mm of their depth, from the phase noise and from what the calibration's own
-    phases scatter by beyond theirs; and the error (h, w) mm of the depth that blur makes at edges,
-    None for Gray code alone."""
+    phases scatter by beyond theirs; the error (h, w) mm of the depth that blur makes at edges, None
+    for Gray code alone; and which points (h, w) bool are extrapolated, None where none are."""
     if phase.is_relative:
         raise InputError(
             f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px: resolve it"
             " by a depth range."
         )
     phase, remaining_px = phase.correct_edges()
-    points = model.points(phase)
+    extrapolated = None
+    if extrapolates and isinstance(model, KnowsSupport):
+        points = model.points(phase, supported=False)
+        extrapolated = np.isfinite(points[..., 2]) & ~model.support(phase)
+    else:
+        points = model.points(phase)
     sigma = model.sigma_z(phase, points)
     noise_px = np.maximum(phase.sigma_px, np.float32(1e-9))
     per_px = sigma / noise_px
@@ -134,10 +157,17 @@ def _measure(model: Model, phase: PhaseMap) -> Measured:
         noise_px = np.hypot(noise_px, np.float32(excess))
         sigma = per_px * noise_px
     if phase.steps == 0:
-        return points, sigma, None
+        return points, sigma, None, _keep_any(extrapolated)
     spoilt = remaining_px > EDGE_SIGMAS * noise_px
     points[spoilt], sigma[spoilt] = np.nan, np.nan
-    return points, sigma, per_px * remaining_px
+    if extrapolated is not None:
+        extrapolated &= ~spoilt
+    return points, sigma, per_px * remaining_px, _keep_any(extrapolated)
+
+
+def _keep_any(mask: np.ndarray | None) -> np.ndarray | None:
+    """Return a mask, or None where it selects nothing."""
+    return mask if mask is not None and mask.any() else None
 
 
 def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
@@ -145,8 +175,10 @@ def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
     valid pixels."""
     axes = list(measured)
     valid = {
-        axis: np.isfinite(points[..., 2]) & np.isfinite(sigma)
-        for axis, (points, sigma, _) in measured.items()
+        axis: np.isfinite(points[..., 2])
+        & np.isfinite(sigma)
+        & (True if extrapolated is None else ~extrapolated)
+        for axis, (points, sigma, _, extrapolated) in measured.items()
     }
     both = np.logical_and.reduce(list(valid.values()))
     if both.any():

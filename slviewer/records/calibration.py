@@ -284,8 +284,8 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
             "Board turned by 180°, corrected": self.turned,
         }
         notes = [
-            "Pixels outside the calibrated region are masked. Uncertainty: one sigma, rigid motion"
-            " apart."
+            "Pixels outside the calibrated region are marked in clouds, and not measured."
+            " Uncertainty: one sigma, rigid motion apart."
         ]
         notes += [f"{title}: {', '.join(names)}." for title, names in named.items() if names]
         notes += [

@@ -1,6 +1,6 @@
 """The cloud of a capture, by one model."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import msgspec
@@ -71,13 +71,16 @@ class Reconstruction(Record, frozen=True, kw_only=True):
 
     Arrays, on the camera's grid: ``points`` (h, w, 3) float32 mm, ``sigma_z`` mm, ``phase`` rad,
     ``modulation`` (h, w) float32, NaN where invalid; ``texture`` (h, w) or (h, w, 3) uint8; of some
-    models ``sigma_calibration`` and ``sigma_edges`` (h, w) float32 mm; of some captures the parts
+    models ``sigma_calibration`` and ``sigma_edges`` (h, w) float32 mm, and of some captures
+    ``extrapolated`` (h, w) bool: points that no target pose supports; of some captures the parts
     ``excess_px`` and ``change`` of a `Misfit`. ``depth_mm``: 1st and 99th
     percentile; ``noise_mm`` and ``sigma_calibration_mm``: medians, of the depth's noise and of what
     the calibration leaves uncertain; ``raised``: the calibration's residuals over their predicted
     noise, by which sigmas are raised; ``misfit_px``: by how much, at most, the axes of the capture
     miss each other beyond what is predicted, None where they do not; ``masked``: share of the
-    pixels, 0 to 1, outside the calibrated region, None for models that mask none; ``scale``: the
+    pixels, 0 to 1, outside the calibrated region, None for models that know none;
+    ``extrapolated``: number of stored points there, beside the ``points``, whose sigma has the
+    median ``extrapolated_mm``; ``scale``: the
     correction of scale, in words; ``frame``: the one that the points are in, in words.
     ``depths``: the share of the points outside the calibrated depths, and what their sigma is
     worth; None where no such depths are known.
@@ -96,6 +99,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     raised: float = 1.0
     misfit_px: float | None = None
     masked: float | None = None
+    extrapolated: Count = 0
+    extrapolated_mm: float | None = None
     scale: str = ""
     frame: str = ""
     depths: DepthCheck | None = None
@@ -128,6 +133,31 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             {} if self.noise_mm is None else {"noise_mm": self.noise_mm}
         )
 
+    def list_notes(self) -> Iterator[str]:
+        """Yield what is to be known of the points beside their figures, as sentences without a
+        stop."""
+        if self.raised > REPORTED_RAISE:
+            yield (
+                f"sigma was raised: the calibration's residuals in {self.axis} are"
+                f" {self.raised:.1f} times their predicted noise, and what disturbs its phases"
+                " disturbs this capture's as well"
+            )
+        if self.misfit_px is not None:
+            yield (
+                "sigma was raised: the x and y patterns disagree by up to"
+                f" {self.misfit_px:.2f} px more than predicted"
+            )
+        if self.depths and not self.depths.is_good:
+            yield self.depths.text()
+        if self.extrapolated and self.extrapolated_mm is not None:
+            yield (
+                f"{self.extrapolated:,} more points are extrapolated, as no target pose illuminated"
+                f" what they look through: their sigma is {self.extrapolated_mm:.3f} mm in the"
+                " median. Merges and measurements do not use them"
+            )
+        if (i := self.imported) is not None:
+            yield "; ".join((f"from {i.file} in {i.unit}", i.normals, i.sigma, *i.notes))
+
     @classmethod
     def tables(cls, found: Mapping[str, "Reconstruction"]) -> list[Table]:  # type: ignore[override]
         """Return one table with a line for each cloud."""
@@ -144,30 +174,13 @@ class Reconstruction(Record, frozen=True, kw_only=True):
                 ),
                 Column("noise", "mm"): each.noise_mm,
                 Column("calibration", "mm", digits=4, detail=True): each.sigma_calibration_mm,
-                Column("masked", "%", digits=1, detail=True): (
+                Column("extrapolated", detail=True): each.extrapolated or None,
+                Column("unsupported", "%", digits=1, detail=True): (
                     None if each.masked is None else 100 * each.masked
                 ),
                 Column("scale", detail=True): each.scale,
             }
             for name, each in found.items()
-        ]
-        raised = [
-            f"{name}: sigma was raised: the calibration's residuals in {each.axis} are"
-            f" {each.raised:.1f} times their predicted noise, and what disturbs its phases disturbs"
-            " this capture's as well."
-            for name, each in found.items()
-            if each.raised > REPORTED_RAISE
-        ]
-        raised += [
-            f"{name}: sigma was raised: the x and y patterns disagree by up to"
-            f" {each.misfit_px:.2f} px more than predicted."
-            for name, each in found.items()
-            if each.misfit_px is not None
-        ]
-        raised += [
-            f"{name}: {text}."
-            for name, each in found.items()
-            if each.depths and (text := each.depths.text())
         ]
         frames = {each.frame: None for each in found.values() if each.frame}
         note = (
@@ -176,10 +189,6 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             " the standard deviations of depth, by the capture's noise and by what the calibration"
             " leaves uncertain."
         )
-        imported = [
-            f"{name}: {'; '.join((f'from {i.file} in {i.unit}', i.normals, i.sigma, *i.notes))}."
-            for name, each in found.items()
-            if (i := each.imported) is not None
-        ]
-        notes = [note, *raised, *imported, *(f"Frame: {frame}." for frame in frames)]
+        texts = [f"{name}: {text}." for name, each in found.items() for text in each.list_notes()]
+        notes = [note, *texts, *(f"Frame: {frame}." for frame in frames)]
         return [Table.of(rows, cls.title, notes).without_empty()]

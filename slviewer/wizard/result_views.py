@@ -88,6 +88,19 @@ def load_scan_cloud(session: Session, name: str) -> ScanCloud:
     return used_points(session, whole_cloud(session, name))
 
 
+def extrapolated_points(session: Session, name: str) -> np.ndarray:
+    """Load the points (n, 3) mm of a capture that no target pose supports, without what edits and
+    region remove."""
+    whole = whole_cloud(session, name, extrapolated=True)
+    if whole.extrapolated is None:
+        return np.zeros((0, 3), np.float32)
+    try:
+        points = used_points(session, whole).points[whole.extrapolated]
+    except InputError:  # nothing remains
+        return np.zeros((0, 3), np.float32)
+    return points[np.isfinite(points[:, 2])]
+
+
 def used_points(session: Session, cloud: ScanCloud) -> ScanCloud:
     """Return a scan's cloud with NaN for what edits and region remove. InputError where nothing
     remains."""
@@ -96,9 +109,9 @@ def used_points(session: Session, cloud: ScanCloud) -> ScanCloud:
     return restrict_cloud(session, cloud.name, cloud, load_region(session))
 
 
-def whole_cloud(session: Session, name: str) -> ScanCloud:
-    """Load the reconstructed cloud of a capture with all of its points. Raises InputError where
-    there is none."""
+def whole_cloud(session: Session, name: str, extrapolated: bool = False) -> ScanCloud:
+    """Load the reconstructed cloud of a capture with all of its points, extrapolated ones where
+    these are wanted. Raises InputError where there is none."""
     meta, arrays = session.load_result(f"clouds/{name}")
     verified = f"verify/{name}"
     errors = session.load_result(verified)[1] if session.has_result(verified) else {}
@@ -107,7 +120,8 @@ def whole_cloud(session: Session, name: str) -> ScanCloud:
     unknown = dict.fromkeys(("phase", "modulation"), np.full(shape, np.nan, np.float32))
     arrays = unknown | {"texture": np.full(shape, 128, np.uint8)} | arrays  # of an imported cloud
     known: dict[str, Any] = {"errors": errors, "misfit": misfit, **arrays}
-    return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], **known)
+    cloud = ScanCloud(name=name, model=meta["model"], axis=meta["axis"], **known)
+    return cloud if extrapolated else cloud.supported()
 
 
 def merged_cloud(session: Session, name: str) -> Ply:

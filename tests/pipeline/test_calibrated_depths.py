@@ -7,16 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from copies import copy_session
 from facts import missing_facts
 
 from slviewer.fringe.presets import multifrequency
 from slviewer.gui.steps.scan import describe_depths, live_html
 from slviewer.pipeline.cloud_record import check_depths, list_outside_depths
 from slviewer.pipeline.models import load_stereo, save_model
+from slviewer.pipeline.operation import Job
+from slviewer.pipeline.reconstruct import scan_cloud
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.reconstruction import DepthCheck, Reconstruction
+from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import FLAT, BoardScene, Pose
 from slviewer.simulation.renderer import Renderer
@@ -129,3 +133,25 @@ def test_live_scan_and_board_in_view_are_compared_with_the_calibrated_depths(
     assert missing_facts(html, "64 %", "489 to 669 mm") == []
     assert "outside" not in live_html(replace(shown, outside=0.0), 500, (489.0, 669.0))
     assert "outside" not in live_html(shown, 500, None)
+
+
+def test_extrapolated_points_are_marked_in_files_and_used_by_nothing_else(
+    recorded: Path, tmp_path: Path, run: Run
+) -> None:
+    folder = copy_session(recorded / "session", tmp_path / "session")
+    path = tmp_path / "all.ply"
+    assert run("reconstruct", folder, "plane_01", "--out", path)[0] == 0
+    with Session.open(folder) as store:
+        record = load_record(store, Reconstruction, "plane_01")
+        stored = store.load_result("clouds/plane_01")[1]["extrapolated"]
+        cloud = scan_cloud(Job(store), "plane_01")
+    ply = read_ply(path)
+    assert record.extrapolated == stored.sum() == ply.scalars["extrapolated"].sum() > 100
+    assert record.points + record.extrapolated == len(ply.points)
+    assert record.extrapolated_mm is not None and record.sigma_calibration_mm is not None
+    assert record.extrapolated_mm > 1.5 * record.sigma_calibration_mm
+    assert cloud.extrapolated is None and np.count_nonzero(cloud.mask) == record.points
+    status, text, _ = run("reconstruct", folder, "plane_01", "--out", path, "--supported-only")
+    ply = read_ply(path)
+    assert status == 0 and len(ply.points) == record.points
+    assert "extrapolated" not in ply.scalars and "extrapolated" in text

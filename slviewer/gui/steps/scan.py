@@ -40,10 +40,16 @@ from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
 from slviewer.records.reconstruction import REPORTED_OUTSIDE
 from slviewer.records.verification import Verification
 from slviewer.simulation.concave import CONCAVE
-from slviewer.wizard.result_views import ScanCloud, used_points, whole_cloud
+from slviewer.wizard.result_views import (
+    ScanCloud,
+    extrapolated_points,
+    used_points,
+    whole_cloud,
+)
 from slviewer.wizard.snapshot import BoardSeen, LiveView, PreviewView, ScanView, SessionView
 
 ONE, ALIGNED = "one", "aligned"
+EXTRAPOLATED = (140, 90, 200)
 LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capture"
 _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibration"}
 
@@ -84,6 +90,12 @@ class ScanPanel(StepPanel):
             self._figures = Text(gui)
             self._colour = self.dropdown("Colour", SCAN_COLOURINGS)
             self._legend = Text(gui)
+            self._extrapolated = self.checkbox(
+                "Extrapolated points",
+                "In violet: no target pose illuminated what they look through; merges and "
+                "measurements do not use them",
+                True,
+            )
             self._view = self.choice("3D view")
             self._model = self.choice("Model")
             self._reconstruct = self.button(
@@ -219,7 +231,8 @@ class ScanPanel(StepPanel):
         self.painter.cancel(self._draw_cloud)
         self.painter.cancel(self._draw_aligned)
         self._forget_cloud()
-        self.layer.remove("cloud")
+        self.painter.cancel(self._draw_extrapolated)
+        self.layer.remove("cloud", "extrapolated")
         self._legend.set("")
 
     def _forget_cloud(self) -> None:
@@ -254,6 +267,7 @@ class ScanPanel(StepPanel):
         self._gallery.set(gallery(sort_scans(self.session.scans), scan.name))
         if self._is_live:
             return
+        self._request_extrapolated(scan)
         if self._view.value == ALIGNED:
             placed, store = [s for s in self.session.scans if s.is_placed], self.context.session
             self.painter.request(
@@ -267,6 +281,25 @@ class ScanPanel(StepPanel):
         else:
             self._request_cloud(self.session, scan)
             self.painter.cancel(self._draw_aligned)
+
+    def _request_extrapolated(self, scan: ScanView) -> None:
+        """Request the extrapolated points of a scan where they are to be shown, else remove
+        them."""
+        store, count = self.context.session, scan.figures.extrapolated
+        self._extrapolated.visible = count > 0
+        if not (count and self._extrapolated.value and self._view.value == ONE):
+            self.painter.cancel(self._draw_extrapolated)
+            self.layer.remove("extrapolated")
+            return
+        key = scan.name, scan.figures.model, count, self.session.restriction(scan.name)
+        self.painter.request(
+            self._draw_extrapolated, key, lambda: extrapolated_points(store, scan.name)
+        )
+
+    def _draw_extrapolated(self, points: np.ndarray) -> None:
+        """Draw extrapolated points (n, 3) mm, unless a live scan runs."""
+        if not self._is_live:
+            self.layer.cloud("extrapolated", points, EXTRAPOLATED)
 
     def _request_cloud(self, session: SessionView, scan: ScanView) -> None:
         """Request the cloud of a reconstructed scan in the chosen colours."""
@@ -427,11 +460,18 @@ def scan_html(scan: ScanView) -> Html:
         "Model": figures.model,
         "Depth range": None if depth is None else f"{depth[0]:.0f} to {depth[1]:.0f} mm",
         "Median noise of z": None if noise is None else f"{noise:.3f} mm",
-        "Masked (not calibrated)": None if masked is None else f"{100 * masked:.1f} % of pixels",
+        "Not supported by poses": None if masked is None else f"{100 * masked:.1f} % of pixels",
+        "Extrapolated there": (
+            f"{figures.extrapolated:,} points, sigma {figures.extrapolated_mm:.3f} mm"
+            if figures.extrapolated_mm
+            else None
+        ),
     }
     html = properties_table(display_name(scan.name, scan.label), properties)
     if masked is not None and masked > MUCH_MASKED:
-        html += alert("Much is masked: capture target poses at the object's place.", "warning")
+        html += alert(
+            "Much is not supported: capture target poses at the object's place.", "warning"
+        )
     if figures.depths and not figures.depths.is_good:
         html += alert(f"{figures.depths.text()}.", "warning")
     if figures.scale:
