@@ -137,9 +137,12 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
     job.progress(0.6, "reconstructing")
     accepts = settings.accept_rejected
     clouds = {
-        n: capture_cloud(
-            store, m, shot, phases, axis=settings.axis, texture=texture, accept_rejected=accepts,
-            warn=warn, extrapolates=not is_pose,
+        n: replace(
+            capture_cloud(
+                store, m, shot, phases, axis=settings.axis, accept_rejected=accepts, warn=warn,
+                extrapolates=not is_pose,
+            ),
+            texture=texture,
         )
         for n, m in chosen.items()
     }  # fmt: skip
@@ -304,9 +307,9 @@ def verify(
             fitted = load_model(store, best)
             texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
             cloud = capture_cloud(
-                store, fitted, shot, each.phases, axis=axis, texture=texture,
-                accept_rejected=accepts,
-            )  # fmt: skip
+                store, fitted, shot, each.phases, axis=axis, accept_rejected=accepts
+            )
+            cloud = replace(cloud, texture=texture)
             how = ReconstructSettings(name, axis=axis, accept_rejected=accepts)
             region = None if each.found.is_searched else each.found.region
             yield cloud_record(store, how, fitted, cloud, each.phases[cloud.axis], region)
@@ -372,7 +375,6 @@ def capture_cloud(
     phases: Mapping[Axis, PhaseMap],
     *,
     axis: Axis | None = None,
-    texture: np.ndarray | None = None,
     accept_rejected: bool = False,
     warn: Warn = ignore_warnings,
     extrapolates: bool = False,
@@ -392,7 +394,7 @@ def capture_cloud(
     for message in (*lens_warnings(store, capture), *check.warnings):
         warn(message)
     cloud = scale_cloud(
-        reconstruct_cloud(model, phases, axis=axis, texture=texture, extrapolates=extrapolates),
+        reconstruct_cloud(model, phases, axis=axis, extrapolates=extrapolates),
         scale_factor(store, model.name),
     )
     if (misfit := check.misfit) is None:
@@ -480,10 +482,9 @@ def reconstruct_captures(
         job.progress(i / len(names), f"{doing} {capture.name}")
         texture = capture_texture(capture, frames, stretch=False)
         cloud = capture_cloud(
-            store, model, capture, phases, texture=texture, accept_rejected=accept_rejected,
-            warn=job.warn,
-        )  # fmt: skip
-        yield capture, frames, cloud
+            store, model, capture, phases, accept_rejected=accept_rejected, warn=job.warn
+        )
+        yield capture, frames, replace(cloud, texture=texture)
 
 
 def scan_cloud(
