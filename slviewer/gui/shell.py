@@ -109,7 +109,7 @@ class Shell(ControlGroup):
     def states(self, notice: Notice) -> bool:
         """Whether the shown step states what a notice reports: results, and findings that have
         their place in its panel."""
-        is_shown = notice.section == STAGES[self._shown_key or self.current]
+        is_shown = notice.section == STAGES.get(self._shown_key)
         return is_shown and (notice.level in ("info", "good") or notice.section in _STATED)
 
     # building

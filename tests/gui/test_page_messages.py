@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import clocks
 import pytest
 from copies import copy_session
 from facts import missing_facts
@@ -118,3 +119,14 @@ def test_one_notification_at_a_time_and_one_line_about_software_rendering(
     expect(software).to_have_count(0)
     assert opened.errors == []
     page.context.close()
+
+
+def test_a_notice_is_shown_on_the_start_page_too() -> None:
+    with Operator() as operator:
+        app = App(operator, Serving(port=0))
+        failures: list[BaseException] = []
+        app._context.report_failure = failures.append  # type: ignore[method-assign]
+        operator.notify("warning", "a cause")
+        assert clocks.until(lambda: app._notified == 1 or bool(failures))
+        app.close()
+    assert failures == [] and app.shell.current == "start"
