@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+import trimesh
 import viser
 import viser.transforms as tf
 from numpy.typing import NDArray
@@ -267,6 +268,10 @@ class SceneLayer:
         else:
             self.remove(name)
         return len(shown)
+
+    def mesh(self, name: str, mesh: trimesh.Trimesh) -> None:
+        """Draw a mesh, mm, with its colours or texture."""
+        self._add(name, self._api.add_mesh_trimesh(self._make_path(name), mesh))
 
     def mark(
         self,

@@ -13,7 +13,7 @@
   const NEAR_MM = 5;
   const PARALLEL_NEAR_MM = 50;
   const SCALE_PX = 130;
-  const CONTENT = [/^(PointCloud|Mesh)Message$/, /^(Image|CameraFrustum)Message$/]; // the former, if there are any
+  const CONTENT = [/^(PointCloud|Mesh|Glb)Message$/, /^(Image|CameraFrustum)Message$/]; // the former, if there are any
   const STYLE = `
     #view-bar, #view-scale { position: fixed; z-index: 5; font: 12px/1 system-ui, sans-serif; color: var(--mantine-color-text, #222); }
     #view-bar { display: flex; border-radius: 5px; overflow: hidden; border: 1px solid var(--mantine-color-default-border, #ccc); }

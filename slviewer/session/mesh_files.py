@@ -245,6 +245,17 @@ def _write_e57(
             file.close()
 
 
+def read_mesh_file(path: Path) -> Any:
+    """Return the mesh of a file that was written here (.stl, .ply, .obj, .glb) as a
+    `trimesh.Trimesh` in mm, in the frame of the camera, with its colours or texture."""
+    import trimesh
+
+    mesh = trimesh.load(path, force="mesh", process=False)
+    if path.suffix == ".glb":  # metres, and turned by its node
+        mesh.vertices = 1e3 * mesh.vertices * (1.0, -1.0, -1.0)
+    return mesh
+
+
 def _to_trimesh(shape: PointSet | Mesh, scale: float = 1.0) -> Any:
     """A trimesh.Trimesh or PointCloud with colours and normals, which are zero where unknown."""
     import trimesh

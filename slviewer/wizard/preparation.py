@@ -41,10 +41,10 @@ SECONDS = {
     "_accumulate": 3.0,
     "_fill_rows": 3.0,
 }
-"""Seconds that the compiler takes for the slowest kernels: the least between two files in the
-caches of seven installations, on one busy core of a server."""
+"""Seconds, roughly, that the compiler takes for the slowest kernels on one core of a server: only
+their shares of the whole matter."""
 OTHERS, OTHER_S = 150, 0.7
-"""How many more there are, by name and signature, and the seconds of each."""
+"""How many more there are, by name and signature, and the seconds of each, roughly."""
 REPORT_S = 0.5
 PATIENCE_S = 3600.0
 """Of one act: the kernels of the first pose take minutes to compile, beside other work or on a slow

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+import trimesh
 import viser
 
 from slviewer.gui.scene import ViewerScene
@@ -40,6 +41,9 @@ def test_hidden_objects_stay_hidden_and_points_keep_their_size(server: SafeServe
     assert draw().point_size == pytest.approx(2 * size)
     scene.scale_points(0.5)
     assert draw().point_size == pytest.approx(size / 2)
+    layer.mesh("mesh", trimesh.creation.box((10, 20, 30)))
+    assert layer.list_objects()["mesh"] == ("mesh", True)
+    layer.remove("mesh")
     changes.clear()
     layer.remove("m1")
     layer.show(False)

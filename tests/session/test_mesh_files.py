@@ -13,7 +13,13 @@ from facts import raises
 from slviewer.errors import InputError, SlviewerError
 from slviewer.registration.open3d_loader import open3d
 from slviewer.session import cad, mesh_files
-from slviewer.session.mesh_files import MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
+from slviewer.session.mesh_files import (
+    MESH_FORMATS,
+    POINT_FORMATS,
+    estimated_bytes,
+    read_mesh_file,
+    write_shape,
+)
 from slviewer.surface.shapes import Mesh, PointSet
 
 RNG = np.random.default_rng(7)
@@ -50,6 +56,7 @@ def test_trimesh_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
     assert write_shape(path, MESH, notes=NOTES) == path.stat().st_size
     found = trimesh.load(path, process=False, force="mesh", maintain_order=True)
     assert len(found.faces) == len(MESH.faces)
+    near(read_mesh_file(path).triangles, MESH.vertices[MESH.faces], 1e-5)  # mm, as it was
     unit = 1000 if suffix == "glb" else 1
     near(unit * found.extents, SIZE, 1e-5)
     if suffix == "stl":

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.gui.panel import PanelPart, StepPanel, scan_labels, scan_options
@@ -29,7 +30,7 @@ from slviewer.pipeline.export import (
 from slviewer.pipeline.mesh import BOARD
 from slviewer.records.kinds import RECORDS
 from slviewer.session.atomic import format_bytes
-from slviewer.session.mesh_files import mesh_formats, point_formats
+from slviewer.session.mesh_files import mesh_formats, point_formats, read_mesh_file
 from slviewer.session.report_details import FIELDS, ReportDetails
 from slviewer.surface.meshing import MeshingPlan, Method
 from slviewer.wizard import result_views
@@ -39,6 +40,10 @@ LIST_PX = 250
 """Height of the list of files, so that the inputs below stay in view."""
 MERGED = "merged"
 POINTS, MESH = "points", "mesh"
+SHOWN_MESHES = ("stl", "ply", "obj", "glb")
+"""Formats of meshes that are read back, to be shown."""
+MOST_MESH_BYTES = 80_000_000
+"""Of a file that is shown: a larger one is slow to send and to draw."""
 MESHES = ("mesh", "merged-mesh")
 FORMAT_NAMES = {"xyz": "XYZ text", "yml": "OpenCV YAML", "xml": "OpenCV XML", "npz": "NumPy"}
 NUMBERS: dict[What, str] = {
@@ -254,10 +259,9 @@ class ExportPanel(StepPanel):
         text = f"{NUMBERS[numbers]}. {describe_format(chosen)}."
         self._number_note.set(note(text) + self._link_html(file))
         self._write_numbers.label = f"Write {numbers} again" if file else f"Write {numbers}"
-        self._write_numbers.color = "gray" if file else None
 
     def _request_cloud(self) -> None:
-        """Request the cloud of the chosen source."""
+        """Request the mesh that was written of the chosen source, else its cloud."""
         name, session = self._source.value, self.session
         merge = session.merge.name if session.merge else ""
         if not name:
@@ -265,9 +269,18 @@ class ExportPanel(StepPanel):
             self.layer.clear()
             return
 
-        def load() -> tuple[np.ndarray, np.ndarray | None]:
-            """Load points (..., 3) mm and colours of the source; None: it has no colours."""
+        what, captured = self._get_shape()
+        chosen = self._shape_format.value
+        file = None
+        if what in MESHES and chosen in SHOWN_MESHES:
+            file = _get_export(session, default_file_name(what, captured, chosen))
+        written = file.path.stat().st_mtime_ns if file and file.path.exists() else 0
+
+        def load() -> trimesh.Trimesh | tuple[np.ndarray, np.ndarray | None]:
+            """Load the mesh, or points (..., 3) mm and colours; None: it has no colours."""
             store = self.context.session
+            if file and file.bytes < MOST_MESH_BYTES:
+                return read_mesh_file(file.path)
             if name == MERGED:
                 whole = result_views.merged_cloud(store, merge)
                 return whole.points, whole.colours
@@ -275,11 +288,17 @@ class ExportPanel(StepPanel):
             return cloud.points, cloud.texture
 
         version = (*_points(session, name), session.restriction(name))
-        key = (name, merge if name == MERGED else version)
+        key = (name, merge if name == MERGED else version, file, written)
         self.painter.request(self._draw_cloud, key, load)
 
-    def _draw_cloud(self, made: tuple[np.ndarray, np.ndarray | None]) -> None:
-        """Draw a loaded cloud, grey where it has no colours."""
+    def _draw_cloud(self, made: trimesh.Trimesh | tuple[np.ndarray, np.ndarray | None]) -> None:
+        """Draw a loaded mesh, or a cloud, grey where it has no colours."""
+        if isinstance(made, trimesh.Trimesh):
+            self.layer.remove("cloud")
+            self.layer.mesh("mesh", made)
+            self.show_points(self._source.value, np.asarray(made.vertices))
+            return
+        self.layer.remove("mesh")
         points, colours = made
         self.show_cloud(self._source.value, points, (150, 150, 150) if colours is None else colours)
 
