@@ -250,7 +250,7 @@ def read_mesh_file(path: Path) -> Any:
     `trimesh.Trimesh` in mm, in the frame of the camera, with its colours or texture."""
     import trimesh
 
-    mesh = trimesh.load(path, force="mesh", process=False)
+    mesh: Any = trimesh.load(path, force="mesh", process=False)
     if path.suffix == ".glb":  # metres, and turned by its node
         mesh.vertices = 1e3 * mesh.vertices * (1.0, -1.0, -1.0)
     return mesh
