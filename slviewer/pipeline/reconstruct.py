@@ -307,8 +307,9 @@ def verify(
             fitted = load_model(store, best)
             texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
             cloud = capture_cloud(
-                store, fitted, shot, each.phases, axis=axis, accept_rejected=accepts
-            )
+                store, fitted, shot, each.phases, axis=axis, accept_rejected=accepts,
+                extrapolates=shot.role != "calibration",
+            )  # fmt: skip
             cloud = replace(cloud, texture=texture)
             how = ReconstructSettings(name, axis=axis, accept_rejected=accepts)
             region = None if each.found.is_searched else each.found.region

@@ -72,7 +72,7 @@ def test_pairs_loops_and_excluded_scans_are_named_by_labels() -> None:
     # the reference first
     assert "Lion <b>" not in shown and said.index("Lion <b>") < said.index("Lion, behind")
     facts = (
-        "0.117", "0.0231", "0.016", "0.004", "orange", "0.26", "0.25 mm", "Letter", "0.24 mm",
+        "0.117", "0.0231", "0.016", "0.004", "0.26", "0.25 mm", "Letter", "0.24 mm",
         "Lion, behind -> Lion <b>", "Tail onto Lion <b>", "3 %", "197,971 points", "99 %",
         "5,527 at depth edges",
         "8 contradicted", "Out of date",

@@ -227,7 +227,7 @@ def test_gamma_below_five_steps_is_named_and_not_taken_for_another_period() -> N
 
 def test_calibrate_from_some_poses(session: Path, run: Run) -> None:
     chosen = ("--models", "stereo", "--poses", "pose_0[1-6]", "--exclude", "pose_06")
-    status, text, error = run("calibrate", session, "--target", BOARD, *chosen)
+    status, text, error = run("calibrate", session, "--target", BOARD, "-v", *chosen)
     assert status == 0 and not missing_facts(text, "5 of 8") and error.count("excluded") == 0
     assert not missing_facts(text, "pose_06", "pose_07", "pose_08")
     status, _, error = run("calibrate", session, "--target", BOARD, "--exclude", "pose_9")

@@ -94,7 +94,7 @@ def test_what_cannot_be_imported_is_said_in_words(
     assert not operator.import_folder("  ")
     for path, facts in (
         (tmp_path / "absent", [tmp_path / "absent"]),
-        (tmp_path, [tmp_path, "layouts"]),
+        (tmp_path, [tmp_path, source]),
     ):
         assert operator.import_folder(path)
         operator.wait_until_idle(HANG_S)
