@@ -34,8 +34,9 @@
     for (const box of document.querySelectorAll("[style*='overflow-x:auto'], [style*='overflow-y:auto']"))
       name(box, { tabindex: 0 }); // so that the arrow keys scroll it
   };
-  let waiting = 0;
-  new MutationObserver(() => (waiting ||= setTimeout(() => ((waiting = 0), complete()), 50))).observe(document, {
+  // before the next picture: at no time has a control no name, also where React sets it anew
+  new MutationObserver(complete).observe(document, {
+    attributeFilter: ["aria-label"],
     childList: true,
     subtree: true,
   });
