@@ -89,7 +89,7 @@ def colour_scans(
     categories = {SCAN: ([titles.get(name, name) for name in names], SCAN_COLOURS)}
     for i, cloud in enumerate(scans):
         T = places.get(cloud.name, np.eye(4)).astype(np.float32)
-        points = cloud.points @ T[:3, :3].T + T[:3, 3]
+        points = move_points(T, cloud.points)
         values = {TEXTURE: cloud.texture, SCAN: np.full(points.shape[:2], i)}
         normals = cloud_normals(cloud) @ T[:3, :3].T
         painted, legend = paint_points(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, expect
-from wizard_page import CALM, PATIENCE_MS, PATIENCE_S, RIG, Opened, button, new_page
+from wizard_page import CALM, PATIENCE_MS, PATIENCE_S, RIG, Opened, browse
 
 from slviewer.gui.app import App
 from slviewer.server.secure import Serving
@@ -31,9 +31,5 @@ def app(operator: Operator) -> Iterator[App]:
 @pytest.fixture
 def opened(browser: Browser, app: App) -> Iterator[Opened]:
     """The operator's page, ready."""
-    page = new_page(browser)
-    found = Opened(page)
-    page.goto(app.server.link())
-    button(page, "1. Rig").wait_for()
-    yield found
-    page.context.close()
+    with browse(browser, app) as found:
+        yield found

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from wizard_page import CALM, Opened, button, choose, click
+from wizard_page import CALM, Opened, button, choose, click, expect_message
 
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray
@@ -63,11 +63,9 @@ def test_uploaded_zip_becomes_poses_and_its_faults_are_listed(
         if name == "broken.zip":
             expect(page.get_by_text(re.compile("the file is not a zip")).first).to_be_visible()
             expect(button(page, "Upload zip")).to_be_enabled()
-    expect(page.get_by_text("1 capture imported as a target pose: capture_0").first).to_be_visible()
-    expect(
-        page.get_by_text(re.compile("not imported: capture_1: it lacks graycode_04")).first
-    ).to_be_visible()
-    expect(page.get_by_text(re.compile("notes.txt in the zip")).first).to_be_visible()
+    expect_message(page, "1 capture imported as a target pose: capture_0")
+    expect_message(page, re.compile("not imported: capture_1: it lacks graycode_04"))
+    expect_message(page, re.compile("notes.txt in the zip"))
     session = operator.session
     assert session is not None and session.load_capture("capture_0").sequence.projector == PROJECTOR
     assert session.load_capture("capture_0").role == "calibration" and opened.errors == []

@@ -20,13 +20,13 @@ from wizard_page import (
     CALM,
     PATIENCE_S,
     SIZE,
-    Opened,
+    browse,
     button,
     choose,
     click,
     cut_labels,
+    expect_message,
     field,
-    new_page,
     wait_until_still,
 )
 
@@ -78,12 +78,8 @@ def measured(
         store.trash_result("calibration/splined")
     with Operator(folder, timing=CALM) as engine:
         wizard = App(engine, Serving(port=0))
-        page = new_page(browser)
-        found = Opened(page)
-        page.goto(wizard.server.link())
-        button(page, "1. Rig").wait_for()
-        yield page, engine, found.errors
-        page.context.close()
+        with browse(browser, wizard) as found:
+            yield found.page, engine, found.errors
         wizard.close()
 
 
@@ -126,7 +122,7 @@ def test_models_are_compared_on_request_and_comparison_can_be_cancelled(
     click(page, "Compare models")
     again = button(page, "Compare again")
     expect(again).to_be_enabled()
-    expect(page.get_by_text("pixelwise is recommended").first).to_be_visible()
+    expect_message(page, "pixelwise is recommended")
     session = engine.snapshot().session
     assert session is not None and session.calibration is not None
     (found,) = session.list_records(ModelComparison)
@@ -257,7 +253,7 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     ).to_be_visible()
     choose(page, "Texture", "1024 px")
     click(page, "Write again")
-    expect(page.get_by_text(re.compile("texture of 1024x1024 px"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"texture of 1024x1024\spx")).first).to_be_visible()
     assert operator.wait_until_idle(PATIENCE_S) is not None
     with page.expect_download() as download:
         page.get_by_role("link", name="Download object_r2_mesh.glb").click()
@@ -311,7 +307,7 @@ def measure_distance(page: Page, operator: Operator, count: int) -> None:
     width = came(operator, count)
     value = width.quantities[0].value
     assert width.what == "distance" and 5 < value < 140
-    expect(page.get_by_text(re.compile(rf"{value:.3f} ±\s0\.\d+\smm")).first).to_be_visible()
+    expect_message(page, re.compile(rf"{value:.3f} ±\s0\.\d+\smm"))
 
 
 @pytest.mark.slow

@@ -79,9 +79,7 @@ def test_network_camera_captures_projector_page(browser: Browser, tmp_path: Path
             expect(
                 page.get_by_text(re.compile(r"camera 320\s×\s240\spx, projector 320\s×\s240\spx"))
             ).to_be_visible()
-            expect(
-                page.get_by_text("its settings are its own").or_(page.get_by_text("settings")).first
-            ).to_be_visible()
+            expect(page.get_by_text("cannot be set from here")).to_be_visible()
 
             operator.choose_target("circles:7x5:10")
             operator.choose_patterns("complementary")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from copies import copy_session
 from playwright.sync_api import Browser, expect
-from wizard_page import CALM, Opened, button, choose, click, new_page
+from wizard_page import CALM, Opened, browse, choose, click
 
 from slviewer.gui.app import App
 from slviewer.server.secure import Serving
@@ -23,12 +23,8 @@ def shown(recorded: Path, tmp_path: Path, browser: Browser) -> Iterator[Opened]:
     folder = copy_session(recorded / "session", tmp_path / "session")
     with Operator(folder, timing=CALM) as engine:
         app = App(engine, Serving(port=0))
-        page = new_page(browser)
-        opened = Opened(page)
-        page.goto(app.server.link())
-        button(page, "1. Rig").wait_for()
-        yield opened
-        page.context.close()
+        with browse(browser, app) as opened:
+            yield opened
         app.close()
 
 

@@ -2,7 +2,8 @@
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from playwright.sync_api import (
     Browser,
@@ -14,6 +15,7 @@ from playwright.sync_api import (
     expect,
 )
 
+from slviewer.gui.app import App
 from slviewer.wizard.service import Timing
 
 SIZE: ViewportSize = {"width": 1280, "height": 800}
@@ -113,6 +115,24 @@ def button(page: Page, name: str) -> Locator:
     return page.get_by_role("button", name=name)
 
 
+@contextmanager
+def browse(browser: Browser, app: App) -> Iterator[Opened]:
+    """The page of a wizard in a browser, ready, until it is closed."""
+    page = new_page(browser)
+    found = Opened(page)
+    page.goto(app.server.link())
+    button(page, "1. Rig").wait_for()
+    yield found
+    page.context.close()
+
+
+def expect_message(page: Page, text: str | re.Pattern[str]) -> None:
+    """Expect a text among the messages: what the step states is no notification."""
+    open_tab(page, "Messages")
+    expect(page.get_by_text(text).filter(visible=True).first).to_be_visible()
+    open_tab(page, "Step")
+
+
 def open_tab(page: Page, name: str) -> None:
     """Show another tab of the panel: Step, Session or Messages."""
     page.get_by_role("tab", name=name).click()
@@ -145,8 +165,10 @@ def click(page: Page, name: str) -> None:
 
 
 def field(page: Page, label: str) -> Locator:
-    """The input beside this label: viser's labels are text, without a tie to their input."""
-    return page.locator(f"xpath=//*[normalize-space(text())='{label}']/following::input[1]")
+    """The input beside this label, which the page may name so: viser's labels are text, as titles
+    of tables are, without a tie to their input."""
+    beside = f"//*[normalize-space(text())='{label}']/following::input[1]"
+    return page.locator(f"xpath={beside}[not(@aria-label) or @aria-label='{label}']")
 
 
 def choose(page: Page, label: str, option: str) -> None:
