@@ -2,7 +2,8 @@
 // and a live image in the view's corner that a click enlarges or shrinks.
 (() => {
   const FOLDER = ".mantine-Paper-root[data-with-border] > .mantine-Paper-root:first-child";
-  const LIVE = "div:has(> [data-live]) + div img";
+  const CORNER = "div:has(> [data-live]) + div";
+  const LIVE = `${CORNER} img`;
   const name = (element, attributes) => {
     for (const [key, value] of Object.entries(attributes))
       if (element.getAttribute(key) !== String(value)) element.setAttribute(key, value);
@@ -13,6 +14,7 @@
     document.documentElement.style.setProperty("--view-width", `${box.width}px`);
   });
   let view = null;
+  let liveSize = ""; // chosen by a click, until no live image is shown: the server writes its marker anew with each camera
   const complete = () => {
     const canvas = document.querySelector("canvas");
     if (canvas && canvas !== view) size.observe((view = canvas));
@@ -20,6 +22,9 @@
       if (buttonHints.has(button.id)) button.title = buttonHints.get(button.id);
     for (const label of document.querySelectorAll(FOLDER))
       name(label, { role: "button", tabindex: 0, "aria-expanded": !label.querySelector(".tabler-icon-chevron-down") });
+    const markers = document.querySelectorAll("[data-live]");
+    if (!markers.length) liveSize = "";
+    for (const marker of markers) name(marker, liveSize ? { "data-live": liveSize } : {});
     for (const image of document.querySelectorAll(LIVE))
       name(image, { role: "button", tabindex: 0, "aria-label": "Camera image", title: "Click to enlarge or shrink" });
     for (const label of document.querySelectorAll("label[for]"))
@@ -41,8 +46,8 @@
     subtree: true,
   });
   document.addEventListener("click", ({ target }) => {
-    const marker = target.matches(LIVE) && target.closest("div:has(> [data-live]) + div").previousSibling.firstChild;
-    if (marker) marker.dataset.live = marker.dataset.live === "large" ? "small" : "large";
+    const marker = target.closest(CORNER)?.previousSibling.firstChild; // the corner: a new picture may have come meanwhile
+    if (marker) marker.dataset.live = liveSize = marker.dataset.live === "large" ? "small" : "large";
   });
   document.addEventListener("keydown", event => {
     if ((event.key === "Enter" || event.key === " ") && event.target.matches(`${FOLDER}, ${LIVE}`)) {

@@ -131,13 +131,13 @@ history.replaceState = () => {};
     const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry()).filter(Boolean);
     if (!entries.length) return;
     event.preventDefault();
-    const target = document.querySelector(input);
-    if (!target) return;
     const found = (await Promise.all(entries.map(list))).flat();
     const [first] = entries;
     const single = entries.length === 1 && first.isFile && !image.test(first.name);
     const given = new DataTransfer();
     given.items.add(single ? found[0].file : new File([await zip(found)], `${first.name}.zip`));
+    let target; // looked for last: the page may have drawn it anew meanwhile
+    while (!(target = document.querySelector(input))) await new Promise((done) => setTimeout(done, 100));
     target.files = given.files;
     target.dispatchEvent(new Event("change", { bubbles: true }));
   });

@@ -36,7 +36,8 @@ def test_dropped_folder_and_clouds_are_imported(
         content = cv2.imencode(".png", frame)[1].tobytes()
         (folder / f"graycode_{i:02d}.png").write_bytes(content)
     drop(page, tmp_path / "first.xyz", tmp_path / "second.xyz")
-    assert operator.wait_for(lambda s: s.scan("first") and s.scan("second"), PATIENCE_S)  # type: ignore[arg-type, return-value]
+    both = operator.wait_for(lambda s: s.scan("first") and s.scan("second"), PATIENCE_S)  # type: ignore[arg-type, return-value]
+    assert both, (operator.snapshot.notices, opened.errors)
     (tmp_path / "notes.md").write_text("x")
     drop(page, tmp_path / "notes.md")
     expect(page.get_by_text("notes.md cannot be imported").first).to_be_visible()
