@@ -501,6 +501,7 @@ def wizard(
     rig: str = "",
     address: Address = Address(),
     no_browser: bool = False,
+    gpu: bool = False,
 ) -> Work:
     """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does
     the same.
@@ -512,13 +513,16 @@ def wizard(
             session, else simulated.
         address: Where and how to serve the page.
         no_browser: Print the address, and open no browser.
+        gpu: Compute live scans on the CUDA device, once it has measured what the processor does.
     """
 
     def start() -> None:
         """Run the wizard in the browser."""
+        from slviewer.geometry.cuda_device import use_device
         from slviewer.gui.app import run
         from slviewer.server.secure import Serving
 
+        use_device(gpu)
         run(session, rig, Serving(*vars(address).values()), open_browser=not no_browser)
 
     return start

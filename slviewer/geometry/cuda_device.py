@@ -1,4 +1,4 @@
-"""Detection of the CUDA device: probed once a process, reported once in the log.
+"""The CUDA device: used where it was asked for, probed once a process, reported once in the log.
 
 Nothing of CUDA is imported before the driver itself reports a device.
 """
@@ -18,16 +18,33 @@ _LOG = logging.getLogger("slviewer.cuda")
 _LOCK = threading.Lock()
 _NO_DEVICE = 100  # CUDA_ERROR_NO_DEVICE
 _cached_name: list[str | None] = []  # empty until the first call of `find_device`
+_wanted: list[bool] = []  # whether it was asked for
+
+
+def use_device(on: bool = True) -> None:
+    """Let the CUDA device compute from now on, or the processor; one that failed stays unused."""
+    _wanted[:] = [on]
+
+
+def is_present() -> bool:
+    """Whether `use_device` can have an effect: numba-cuda is installed, and the driver has a
+    device that has not failed."""
+    if importlib.util.find_spec("numba_cuda") is None or _cached_name == [None]:
+        return False
+    return _count_devices()[0] > 0
 
 
 def find_device() -> str | None:
-    """The name of the device that computes; None where there is none, or where it failed before.
+    """The name of the device that computes; None where none was asked for (`use_device`), there is
+    none, or it failed before.
 
     It needs the package numba-cuda (``pip install 'slviewer[cuda]'``); without it, no device is
     searched for. A driver that does not work is logged once. ``CUDA_VISIBLE_DEVICES=`` hides the
     devices, as from any program.
     """
     with _LOCK:
+        if _wanted != [True]:
+            return None
         if not _cached_name:
             _cached_name.append(_probe_device())
         return _cached_name[0]
@@ -38,7 +55,7 @@ def disable_device(error: Exception) -> None:
     with _LOCK:
         if _cached_name != [None]:
             _LOG.warning(
-                "the CUDA device failed, and the processor takes over: %s", _first_line(error)
+                "The graphics card failed, and the processor takes over: %s", _first_line(error)
             )
         _cached_name[:] = [None]
 
@@ -76,7 +93,7 @@ def _probe_device() -> str | None:
         name = name.decode() if isinstance(name, bytes) else str(name)
     except Exception as error:
         _LOG.warning(
-            "the CUDA device cannot be used, and the processor computes: %s", _first_line(error)
+            "The graphics card cannot be used, and the processor computes: %s", _first_line(error)
         )
         return None
     _LOG.info("clouds are computed on %s", name)

@@ -431,10 +431,16 @@ class ControlGroup:
         self.react(handle.on_update)
         return handle
 
-    def checkbox(self, label: str, hint: str | None = None, value: bool = False) -> Any:
-        """Add a checkbox."""
+    def checkbox(
+        self,
+        label: str,
+        hint: str | None = None,
+        value: bool = False,
+        do: Callable[[bool], Any] | None = None,
+    ) -> Any:
+        """Add a checkbox; `do(value)` is called when a user changes it."""
         handle = self._gui.add_checkbox(label, value, hint=hint or HINTS.get(label))
-        self.react(handle.on_update)
+        self.react(handle.on_update, None if do is None else lambda: do(handle.value))
         return handle
 
     def dropdown(

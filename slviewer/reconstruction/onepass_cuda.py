@@ -19,6 +19,14 @@ from slviewer.reconstruction.onepass import Fast, LightLevels, OnePass, PassResu
 if TYPE_CHECKING:  # it imports CUDA
     from slviewer.reconstruction.onepass_cuda_card import Card
 
+COMPARED = 3
+"""Scans of each pass that the processor computes too, before the device's are used alone."""
+AGREED = 1e-5
+"""Distance between two points, of their depth, that rounding explains: float32 keeps 6e-8, and the
+dozens of operations from frames to points lose two digits."""
+MOST_APART = 1e-3
+"""Share of pixels beyond that: those on the edge of a mask's limit, or between two periods."""
+
 
 def one_pass(sequence: PatternSequence, model: Fast, axis: Axis) -> OnePass:
     """Return the fastest one-pass reconstruction available: on the CUDA device, or else on the
@@ -44,10 +52,12 @@ class CudaPass(OnePass):
 
     Coefficients stay on the device, frames go there once, and maps come back when spikes are
     repaired. Frames and scans in memory from `cuda_device.allocate_frames` travel at full speed.
-    Should the device fail, the processor goes on.
+    Should the device fail, or measure anything else than the processor in its first scans, the
+    processor goes on.
     """
 
     _card: "Card | None" = None
+    _compared = 0
 
     def _pack_depths(self) -> tuple[kernels.Depths | StereoRig, tuple[int, int]]:
         """Return the calibration as the kernels take it, and the size (h, w) of its frames."""
@@ -64,14 +74,16 @@ class CudaPass(OnePass):
         frames, scan = self._begun(frames, light, out)
         if cuda_device.find_device() is not None:
             try:
-                return self._run_on_device(frames, scan)
+                scan = self._run_on_device(frames, scan)
+                if self._compared < COMPARED:
+                    check_agreement(scan, self._run_on_processor(frames, scan.light))
+                    self._compared += 1
+                return scan
             # of the driver, the compiler, or memory: whatever it is, there is a processor
             except Exception as error:
                 cuda_device.disable_device(error)
         self._card = None
-        if isinstance(self.model, StereoModel):
-            return self._run_on_processor(self.model, frames, scan)
-        return super().run(frames, scan.light, scan)
+        return self._run_on_processor(frames, scan.light, scan)
 
     def card(self, dtype: np.dtype) -> "Card":
         """Return the buffers and kernels on the device for frames of a dtype, for use step by step;
@@ -97,18 +109,35 @@ class CudaPass(OnePass):
         return scan
 
     def _run_on_processor(
-        self, model: StereoModel, frames: np.ndarray, scan: PassResult
+        self, frames: np.ndarray, light: LightLevels, out: PassResult | None = None
     ) -> PassResult:
-        """Compute a stereo calibration's scan on the processor."""
+        """Compute a scan on the processor, in the arrays of ``out`` where given."""
+        if not isinstance(self.model, StereoModel):
+            return super().run(frames, light, out)
         decoded = decode(self.sequence, frames, self.axis)
-        points = model.points(decoded)
-        return replace(
-            scan,
-            points=points,
-            phase=decoded.phase,
-            reason=decoded.reason,
-            sigma_z=model.sigma_z(decoded, points),
-            modulation=decoded.modulation,
-            texture=texture(self.sequence, frames),
-            light=replace(scan.light, noise=decoded.noise),
+        points = self.model.points(decoded)
+        return PassResult(
+            self.axis,
+            self.model.name,
+            points,
+            decoded.phase,
+            decoded.reason,
+            self.model.sigma_z(decoded, points),
+            decoded.modulation,
+            texture(self.sequence, frames),
+            replace(light, noise=decoded.noise),
+        )
+
+
+def check_agreement(found: PassResult, expected: PassResult) -> None:
+    """Raise ArithmeticError where a device's scan is not the processor's: more than MOST_APART of
+    the pixels are masked otherwise, or lie farther apart than AGREED of their depth."""
+    z = expected.points[..., 2]
+    with np.errstate(invalid="ignore"):
+        distance = np.abs(found.points - expected.points).max(axis=-1)
+        is_apart = (found.reason != expected.reason) | (distance > AGREED * z)
+    is_apart |= np.isnan(found.points[..., 2]) != np.isnan(z)
+    if (share := is_apart.mean()) > MOST_APART:
+        raise ArithmeticError(
+            f"{share:.1%} of its pixels are not what the processor measures in the same frames"
         )

@@ -16,6 +16,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry import cuda_device
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.models import (
     accepts_rejected,
@@ -185,6 +186,7 @@ class LiveScan(Service):
         with a notice."""
         released = time.monotonic()
         while (shot := self.stream.wait_next()) is not None:
+            card = cuda_device.find_device()
             try:
                 live = self._load_model()
                 points, texture = live.cloud(shot.frames)
@@ -192,6 +194,12 @@ class LiveScan(Service):
                 self._notices.add_failure("Live", error)
                 self._acquisition.stop_stream()
                 return
+            if card and cuda_device.find_device() is None:
+                text = (
+                    f"{card} failed, or did not measure what the processor does: the processor"
+                    " goes on. The log has the reason."
+                )
+                self._notices.add("warning", text)
             now = time.monotonic()
             with self._condition:
                 self._made.append((now, now - shot.begun))

@@ -19,6 +19,7 @@ from slviewer.devices.protocols import Rig
 from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.geometry import cuda_device
 from slviewer.pipeline.capture import check_space, depth_axis, save_frames
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.import_captures import (
@@ -315,6 +316,11 @@ class Operator(RigRequests, ResultRequests):
         )  # fmt: skip
         live.start()
         self._live = live
+
+    @request("Choosing the processor")
+    def use_graphics_card(self, on: bool) -> None:
+        """Let the graphics card compute live scans from the next one on, or the processor."""
+        cuda_device.use_device(on)
 
     @request("Ending the live scan")
     def stop_live(self) -> None:

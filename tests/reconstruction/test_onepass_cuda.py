@@ -137,6 +137,8 @@ def scans_to(folder):
     """What a device makes of all cases, saved; and then what happens when it fails in the
     middle."""
     said = []
+    assert cuda_device.find_device() is None  # nobody asked for one
+    cuda_device.use_device()
     folder, handler = Path(folder), logging.Handler()
     handler.emit = lambda record: said.append(record.getMessage())
     logging.getLogger("slviewer.cuda").addHandler(handler)
@@ -155,8 +157,10 @@ def scans_to(folder):
         assert cuda_device.find_device() is not None
         maps = {key: value for key, value in vars(scan).items() if isinstance(value, np.ndarray)}
         np.savez(folder / f"{number}.npz", **maps)
-    bench_rows.TIMES = bench_rows.AHEAD = 1  # in this process alone
+    bench_rows.TIMES = bench_rows.AHEAD = bench_rows.COPIED = 1  # in this process alone
     rows = bench_rows.gpu_rows(*made("complementary code, splined"))
+    assert cuda_device.find_device() is None
+    cuda_device.use_device()
     (folder / "rows.json").write_text(json.dumps(rows))
     for case in list(CASES)[::2]:
         sequence, model, frames = made(case)
@@ -175,7 +179,7 @@ def scans(request, tmp_path_factory):
         if importlib.util.find_spec("numba.cuda") is None:
             pytest.skip("numba has no CUDA simulator here: pip install 'slviewer[cuda]'")
         there = {"NUMBA_ENABLE_CUDASIM": "1"}
-    elif cuda_device.find_device() is None:
+    elif not cuda_device.is_present():
         pytest.skip("there is no CUDA device here")
     here = Path(__file__)
     code = (
@@ -237,11 +241,12 @@ def test_a_device_that_fails_is_told_once_and_the_processor_goes_on(scans):
             np.testing.assert_allclose(found["points"], model.points(phase), rtol=0, atol=1e-3)
     said = json.loads((scans / "said.json").read_text())
     (failure,) = [line for line in said if not missing_facts(line, "failed")]
-    assert not missing_facts(failure, "CUDA", "division by zero")
+    assert not missing_facts(failure, "graphics card", "division by zero")
 
 
 def test_without_a_device_all_is_the_processors(monkeypatch, caplog):
     monkeypatch.setattr(cuda_device, "_cached_name", [])
+    monkeypatch.setattr(cuda_device, "_wanted", [True])
     # as if the kernel's module were another version's
     broken = SimpleNamespace(cuInit=lambda flags: 803)
     monkeypatch.setattr(cuda_device.ctypes, "CDLL", lambda name: broken)
@@ -265,8 +270,9 @@ def test_a_look_for_a_driver_loads_nothing_else():
     code = (
         "import sys, importlib.util\n"
         "real = importlib.util.find_spec\n"
-        "importlib.util.find_spec = lambda name: name == 'numba_cuda' or real(name)\n"
+        "importlib.util.find_spec = lambda name: real(name) or name == 'numba_cuda'\n"
         "from slviewer.geometry import cuda_device\n"
+        "cuda_device.use_device()\n"
         "found = cuda_device.find_device()\n"
         "sys.exit(found is None and bool({'numba', 'numba_cuda'} & set(sys.modules)))"
     )
@@ -280,6 +286,27 @@ def test_a_stereo_pass_refuses_what_it_cannot_do():
     assert one.shape == (HEIGHT, WIDTH)
     with pytest.raises(InputError):
         one.run(np.zeros((len(SEQUENCES["p18"].frames), HEIGHT, WIDTH + 1), np.uint8))
+
+
+def test_a_device_that_measures_otherwise_is_found_out(monkeypatch, caplog):
+    """Its first scans are compared with the processor's, whose scan is returned then."""
+    monkeypatch.setattr(cuda_device, "_cached_name", ["a card"])
+    monkeypatch.setattr(cuda_device, "_wanted", [True])
+    monkeypatch.setattr(cuda_device, "allocate_frames", np.empty)
+    sequence, model, frames = made("steps and Gray code, pixelwise")
+    right = OnePass(sequence, model, "x").run(frames)
+    for distance, is_found in ((1e-3, False), (0.05, True)):  # mm, at depths of 400 mm
+
+        def run(job, frames, scan, moved=distance):
+            return replace(right, points=right.points + np.float32(moved))
+
+        monkeypatch.setattr(CudaPass, "_run_on_device", run)
+        scan = CudaPass(sequence, model, "x").run(frames)
+        assert (cuda_device.find_device() is None) == is_found
+        error = np.nanmax(np.abs(scan.points - right.points))
+        assert error == (0 if is_found else pytest.approx(distance, rel=0.1))
+    (said,) = caplog.messages
+    assert not missing_facts(said, "%", "processor")
 
 
 @pytest.mark.parametrize("cc", [pytest.param((7, 5), marks=pytest.mark.slow), (9, 0)])

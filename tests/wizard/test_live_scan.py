@@ -18,12 +18,13 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import short
+from slviewer.geometry import cuda_device
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.models import load_stereo
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.wizard import live_scan
+from slviewer.wizard import acquisition, live_scan
 from slviewer.wizard.acquisition import Stream
 from slviewer.wizard.live_scan import LiveCloud, LiveModel
 from slviewer.wizard.operator import Operator
@@ -143,6 +144,23 @@ def test_stopping_frees_the_devices_and_starting_again_goes_on(wizard: Wizard) -
     assert len(wizard.clouds) == seen and operator.snapshot().rig.state == "open"
     assert operator.stop_live()  # twice does no harm
     until(lambda: "slviewer live" not in {thread.name for thread in threading.enumerate()})
+
+
+@pytest.mark.slow
+def test_a_graphics_card_that_fails_is_named_and_the_processor_goes_on(
+    wizard: Wizard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cuda_device, "_cached_name", ["A card"])  # there is none
+    monkeypatch.setattr(cuda_device, "_wanted", [])
+    monkeypatch.setattr(cuda_device, "allocate_frames", np.empty)
+    monkeypatch.setattr(acquisition, "allocate_frames", np.empty)
+    assert cuda_device.find_device() is None  # until it is asked for
+    assert wizard.operator.use_graphics_card(True)
+    assert cuda_device.find_device() == "A card"
+    assert wizard.operator.start_live()
+    wizard.goes_on()
+    assert wizard.reports("warning", "A card", "processor")
+    assert cuda_device.find_device() is None
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import viser
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
+from slviewer.geometry import cuda_device
 from slviewer.gui.capture_inputs import ExposureInputs, ImportInputs, SimulatedObject, TurnInputs
 from slviewer.gui.colouring import (
     SCAN_COLOURINGS,
@@ -84,6 +85,12 @@ class ScanPanel(StepPanel):
             "Save cloud", lambda: operator.save_live(self._name.value), "download"
         )
         self._live_status = Text(gui)
+        self.checkbox(
+            "Graphics card",
+            "Computes the next live scan; its first clouds are compared with the processor's",
+            cuda_device.find_device() is not None,
+            operator.use_graphics_card,
+        ).visible = cuda_device.is_present()
         self._gallery = Text(gui)
         with gui.add_folder("Cloud") as self._cloud_folder:
             self._scan = scan = self.choice("Scan")
