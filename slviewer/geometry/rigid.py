@@ -55,7 +55,7 @@ def turn_about(rotation: Floats, centre: Floats, shift: Floats | float = 0.0) ->
     return rigid_transform(R, centre - R @ centre + shift)
 
 
-def move_points(T: Floats, points: np.ndarray) -> Floats:
+def move_points(T: NDArray[np.floating], points: np.ndarray) -> Floats:
     """(..., n, 3): points (n, 3) mm moved by each motion ``T`` (..., 4, 4); NaN stays NaN."""
     return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
