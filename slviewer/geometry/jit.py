@@ -21,8 +21,8 @@ from numba.extending import intrinsic
 
 from slviewer.geometry.jit_cache import cache_folder
 
-COMPILED: list[str] = []
-"""Names of the kernels that this process has compiled or loaded, in order, once a signature."""
+COMPILED: dict[tuple[str, str], None] = {}
+"""Names and signatures of the kernels that this process has compiled or loaded, in order."""
 _LOCK = threading.Lock()
 _SETTINGS: Any = numba.config
 
@@ -75,7 +75,7 @@ def _compile_once(compile_here: Callable[[Any], Any], path: Path) -> Callable[[A
                 # of this process, were it forked
                 stack.enter_context(FileLock(path, thread_local=False))
             compiled = compile_here(signature)
-            COMPILED.append(path.stem)
+            COMPILED[path.stem, str(signature)] = None
             return compiled
 
     return compile_or_load

@@ -135,7 +135,7 @@ def _report_share() -> None:
     """Print the share that is done, whenever it has grown."""
     printed = -1.0
     while True:
-        share = round(share_compiled(COMPILED), 3)
+        share = round(share_compiled([name for name, _ in tuple(COMPILED)]), 3)
         if share > printed:
             print(share, flush=True)
             printed = share

@@ -89,7 +89,8 @@ def test_progress_grows_with_each_kernel_by_the_time_that_it_takes() -> None:
 
 def test_compiled_kernels_are_named(tmp_path: Path) -> None:
     compile_once = jit._compile_once(lambda signature: signature, tmp_path / "coded_rows.lock")
-    assert compile_once("float32") == "float32" and jit.COMPILED[-1] == "coded_rows"
+    assert compile_once("float32") == "float32" == compile_once("float32")  # loaded anew
+    assert list(jit.COMPILED)[-1] == ("coded_rows", "float32")
 
 
 def test_preparation_waits_for_kernels_that_take_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
