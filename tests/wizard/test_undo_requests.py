@@ -143,10 +143,11 @@ def test_a_deleted_capture_comes_back_although_another_took_its_name(operator: O
     add_capture(store, "scan_03", 9)
     other = store.load_capture("scan_03").hash
     assert operator.undo() and state(operator) == before
-    assert store.deleted_captures() == []  # the name is in use, but the other is in the trash
+    # the name is in use, but the other is in the trash
+    assert operator.wait_until_idle(HANG_S).content.deleted_scans == ()
     (trashed,) = (each for each in store.trashed() if each.is_capture)
     assert trashed.name == "scan_03"
-    store.restore([trashed])
+    store.exchange({trashed.name: trashed.place})
     assert store.load_capture("scan_03").hash == other
 
 
