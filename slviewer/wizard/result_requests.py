@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -47,10 +47,10 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
-from slviewer.pipeline.stored_records import load_record
+from slviewer.pipeline.stored_records import load_record, load_stored
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.measurement import MeasuredRegion
+from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused
@@ -308,6 +308,22 @@ class ResultRequests(ChangeRequests):
         chosen["at"] = [int(number) for number in np.ravel(at)] if len(at) else ()
         settings = MeasureSettings(on, what, **chosen, load=partial(surface_to_measure, name=on))
         self._run(MEASURING, measure, settings, "measurements", finish=self._finish("measure"))
+
+    @request(MEASURING)
+    def move_point(self, name: str, end: int, place: Place) -> None:
+        """Measure again with one of the points of a measurement, from 0, at another place of its
+        surface."""
+        before = load_stored(self._store, Measurement, name)
+        on, at = before.record.source, before.record.places()
+        if before.stale or not at:
+            raise InputError(f"{before.label} has no points on its surface: measure again")
+        at[end] = place
+        settings = MeasureSettings(
+            on, cast(Tool, before.record.what), [int(number) for number in np.ravel(at)],
+            name=before.record.name, load=partial(surface_to_measure, name=on), replaces=name,
+        )  # fmt: skip
+        change = f"move a point of {before.label}"
+        self._run(MEASURING, measure, settings, "measurements", change=change)
 
     @request(MEASURING)
     def measure_between(self, a: str, b: str) -> None:

@@ -208,6 +208,13 @@ def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> 
     return (index[1], index[0]) if on.organised else index[0]
 
 
+def snap(on: MeasuredSurface, point: np.ndarray) -> Place:
+    """Return the place of the measured point closest to a point (3,) mm."""
+    off = ((on.points - point) ** 2).sum(axis=-1)
+    index = [int(i) for i in np.unravel_index(np.nanargmin(off), off.shape)]
+    return (index[1], index[0]) if on.organised else index[0]
+
+
 def point_at(on: MeasuredSurface, place: Place) -> np.ndarray:
     """Return the point (3,) mm of a place on the surface."""
     index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
