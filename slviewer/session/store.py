@@ -55,6 +55,7 @@ class Session(Decisions):
         self._created: Literal["", "session", "folder"] = ""  # what this object made
         self._together: atomic.Together | None = None
         self._kept: dict[str, Path | None] | None = None  # of `keep_replaced`
+        self._kinds: tuple[str, ...] = ()
         self.recovered: tuple[str, ...] = ()  # captures of a dead writer, completed on opening
 
     # opening and closing
@@ -320,10 +321,11 @@ class Session(Decisions):
         return replaced
 
     @contextmanager
-    def keep_replaced(self) -> Iterator[dict[str, Path | None]]:
-        """Context manager: results that are replaced in it go to the trash. Gives what `exchange`
-        reverses it with, complete at its end. For one thread."""
+    def keep_replaced(self, *kinds: str) -> Iterator[dict[str, Path | None]]:
+        """Context manager: results of these kinds that are replaced in it go to the trash. Gives
+        what `exchange` reverses it with, complete at its end. For one thread."""
         kept = self._kept = dict[str, Path | None]()
+        self._kinds = kinds
         try:
             yield kept
         finally:
@@ -331,7 +333,7 @@ class Session(Decisions):
 
     def _keep(self, name: str) -> Path | None:
         """Return where in the trash the result goes that is replaced; None: it is deleted."""
-        if self._kept is None or name in self._kept:
+        if self._kept is None or name in self._kept or name.partition("/")[0] not in self._kinds:
             return None
         target = self._place_of(name)
         place = self._kept[name] = self._trash_place(target) if target.exists() else None

@@ -253,7 +253,7 @@ class Engine:
                 used = replace(settings, accept_rejected=True)
             if not change:
                 return operation.run(job.store, used, job.progress, job.warn)
-            with job.store.keep_replaced() as replaced:
+            with job.store.keep_replaced(operation.record.kind, "verdict") as replaced:
                 try:
                     return operation.run(job.store, used, job.progress, job.warn)
                 finally:  # a rejected calibration is saved too
@@ -277,9 +277,9 @@ class Engine:
         if reader is None:
             return
         target, captures = reader.target(), reader.session.captures()
-        there = {capture.name for capture in captures}
-        with self._lock:  # a deleted capture that is restored is processed again
-            self._queued = {key for key in self._queued if key[0] in there}
+        there = {(capture.name, capture.hash) for capture in captures}
+        with self._lock:  # a deleted or retaken capture that is restored is processed again
+            self._queued = {key for key in self._queued if key[:2] in there}
         for capture in captures:
             key = (capture.name, capture.hash, target)
             with self._lock:

@@ -96,7 +96,7 @@ class ResultRequests(ChangeRequests):
             before = load_record(self._store, ModelCalibration, "stereo").settings
         known = {key: before[key] for key in ("camera", "fix_camera") if key in before}
         settings = CalibrateSettings(target, models, replace_all=True, **known)
-        self._run("Calibrating", calibrate, settings, "calibration")
+        self._run("Calibrating", calibrate, settings, "calibration", change="calibrate")
 
     @request("Comparing the models")
     def compare_models(self) -> None:
@@ -137,7 +137,8 @@ class ResultRequests(ChangeRequests):
         """Align reconstructed scans to those in place; without names all that were not aligned
         yet."""
         settings = AlignSettings(self._check_names(names), only_reconstructed=True)
-        self._run("Aligning", align, settings, "merge")
+        labels = " ".join(["align", ", ".join(map(self._label, names))]).strip()
+        self._run("Aligning", align, settings, "merge", change=labels)
 
     def _check_names(self, names: Sequence[str]) -> list[str]:
         """Return names of captures. Raises InputError for one that does not exist."""

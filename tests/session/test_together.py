@@ -128,17 +128,24 @@ def test_what_was_replaced_is_exchanged_back_and_forth(folder):
             return {name: session.load_result(name)[0]["age"] for name in session.result_names()}
 
         before = ages()
-        with session.keep_replaced() as replaced:
+        with session.keep_replaced("calibration", "verdict") as replaced:
             save_new(session)
             session.save_result(added, {"age": "new", "inputs": {}}, {})
             session.save_result(added, {"age": "newer", "inputs": {}}, {})
         after = ages()
         assert replaced.keys() == {*before, added} and replaced[added] is None
         assert after == dict.fromkeys(NAMES, "new") | {added: "newer"}
-        with session.keep_replaced() as given_up, pytest.raises(InputError), session.together():
+        with (
+            session.keep_replaced("verdict") as given_up,
+            pytest.raises(InputError),
+            session.together(),
+        ):
             session.save_result(added, {"age": "none", "inputs": {}}, {})
             raise InputError("it cannot be made")
         assert given_up == {} and ages() == after
+        with session.keep_replaced("merge") as of_others:
+            session.save_result(added, {"age": "newer", "inputs": {}}, {})
+        assert of_others == {}
         for expected in (before, after, before):
             replaced = session.exchange(replaced)
             assert ages() == expected
