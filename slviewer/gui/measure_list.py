@@ -192,8 +192,10 @@ _MARKS = tuple(f"cursor {cursor}" for cursor in CURSORS)
 _HISTOGRAM_PX = 230
 Lines = dict[str, tuple[CutPlane, list[np.ndarray]]]
 """{section: its plane, and its lines (k, 2) mm in it}."""
-Drawings = tuple[Sequence[Stored[Measurement]], dict[str, tuple[str, bool, bool]], Lines]
-"""The measurements, {id: label, is stale, is chosen} of those that are drawn, and the sections."""
+Looks = dict[str, tuple[Any, ...]]
+"""{id: label, whether it is stale, and chosen, and the values}."""
+Drawings = tuple[Sequence[Stored[Measurement]], Looks, Lines]
+"""The measurements, the looks of those that are drawn, and the sections."""
 
 
 class MeasurementList(PanelPart):
@@ -207,7 +209,7 @@ class MeasurementList(PanelPart):
 
     def build(self) -> None:
         """Create the inputs."""
-        self._known: set[str] = set()
+        self._known: dict[str, list[float]] = {}
         self._drawn: dict[str, Any] = {}
         self._lines: Lines = {}
         gui, operator = self._gui, self._operator
@@ -248,16 +250,17 @@ class MeasurementList(PanelPart):
         ones."""
         session, measured = self.panel.session, self.panel.session.measurements
         names = [each.name for each in measured]
+        values = _list_values(measured)
         before = self.chosen and self.chosen.name
         if session.folder != self._folder:
-            self._folder, self._known, before = session.folder, set(names), None
+            self._folder, self._known, before = session.folder, values, None
             # the measurements of another session have the same ids
             self._layer.remove(*self._drawn)
             self._drawn, self._lines = {}, {}
             for show in (self._show_drawings, self._histogram.set, self._show_section):
                 self._painter.cancel(show)
         new = [each for each in measured if each.name not in self._known]
-        self._known = set(names)
+        self._remember(values)
         # the latest first, by their names; by their ids too where names occur twice
         titles = list(name_records(measured))
         options = dict(zip(titles[::-1], names[::-1], strict=True))
@@ -280,6 +283,13 @@ class MeasurementList(PanelPart):
         return new
 
     # inside
+
+    def _remember(self, values: dict[str, list[float]]) -> None:
+        """Remember the values of all measurements, and forget the lines of sections that have
+        changed: a point of them was moved."""
+        changed = {name for name, known in self._known.items() if known != values.get(name)}
+        self._lines = {name: each for name, each in self._lines.items() if name not in changed}
+        self._known = values
 
     def _request_rename(self) -> None:
         """Request the entered name for the chosen measurement."""
@@ -351,7 +361,7 @@ class MeasurementList(PanelPart):
         read from disk."""
         on_surface = {each.name for each in measured if each.record.source == on}
         looks = {
-            each.name: (each.label, each.stale, each is chosen)
+            each.name: (each.label, each.stale, each is chosen, *self._known[each.name])
             for each in measured
             if on_surface & {each.name, *each.record.of}
         }
@@ -386,6 +396,11 @@ class MeasurementList(PanelPart):
         self._drawn = looks
         if is_loaded:
             self.redraw()
+
+
+def _list_values(measured: Sequence[Stored[Measurement]]) -> dict[str, list[float]]:
+    """Return the values of measurements by their ids."""
+    return {each.name: [q.value for q in each.record.quantities] for each in measured}
 
 
 def _round_range(along: np.ndarray) -> tuple[float, float, float]:

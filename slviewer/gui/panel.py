@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
@@ -16,7 +16,7 @@ import viser
 
 from slviewer.devices.browser import PageChannels, PageRole
 from slviewer.devices.page_channel import PageState
-from slviewer.errors import InputError, hide_passwords
+from slviewer.errors import InputError, SlviewerError, hide_passwords
 from slviewer.gui.hints import HINTS
 from slviewer.gui.scene import Colour, ViewerScene, Viewpoints
 from slviewer.gui.widgets import NOTICES, link, paragraph
@@ -126,6 +126,16 @@ class PanelContext:
         session = self.operator.snapshot().session
         folder = session.folder if session else path.parent
         return self.server.downloads.offer(path, within=folder)
+
+    def offer_frame(self, name: str) -> str:
+        """Return the attributes of a capture's picture by which the page reads its frame's pixels;
+        none where there is no such frame."""
+        with suppress(SlviewerError):
+            capture = self.session.load_capture(name)
+            path, size = capture.frame_file(capture.brightest_frame)
+            address = self.server.downloads.offer(path, within=capture.folder)
+            return f'data-frame="{address}" data-width="{capture.size[0]}" data-bytes="{size}"'
+        return ""
 
     def offer_archive(self) -> str:
         """Return the download address of a zip of the session's files and results, without

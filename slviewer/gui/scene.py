@@ -134,6 +134,11 @@ class SceneLayer:
         click would pick, as long as it is part of a visible panel."""
         return f'<i data-hover="{self._make_path(name)}"></i>'
 
+    def drag_html(self, name: str, marks: Sequence[str]) -> str:
+        """Return what makes the page drag marks over the points of an object."""
+        paths = ";".join(map(self._make_path, marks))
+        return f'<i data-drag="{self._make_path(name)}" data-marks="{paths}"></i>' if paths else ""
+
     def show(self, visible: bool) -> None:
         """Show or hide everything in the layer, now and when it is filled later."""
         self._root.visible = visible
@@ -280,14 +285,32 @@ class SceneLayer:
         text: str,
         colour: Colour = (220, 40, 40),
         radius_mm: float = 1.5,
+        on_drag: Callable[[np.ndarray], None] | None = None,
     ) -> None:
-        """Draw a point (3,) mm as a ball with a label."""
-        path = self._make_path(name)
-        ball = self._api.add_icosphere(
-            path, radius=radius_mm, color=colour, position=np.asarray(point, float)
-        )
-        self._add(name, ball, text)
-        self._api.add_label(f"{path}/words", text, anchor="bottom-left")
+        """Draw a point (3,) mm as a ball with a label. ``on_drag`` is called with the point of the
+        cloud (3,) mm that it was dragged to, where `drag_html` names it."""
+        path, position = self._make_path(name), np.asarray(point, float)
+        if on_drag is None:
+            node: Any = self._api.add_frame(path, show_axes=False, position=position)
+        else:  # the page drags it, over the cloud: viser's own handles stay hidden
+            node = self._api.add_transform_controls(
+                path,
+                disable_axes=True,
+                disable_sliders=True,
+                disable_rotations=True,
+                position=position,
+            )
+
+            @node.on_update
+            def _(event: Any) -> None:
+                """Call back with the end of a drag."""
+                if event.phase == "end":
+                    self._submit(partial(on_drag, np.array(event.target.position, float)))
+
+        self._api.add_icosphere(f"{path}/ball", radius=radius_mm, color=colour)
+        self._add(name, node, text)
+        if text:
+            self._api.add_label(f"{path}/words", text, anchor="bottom-left")
 
     def ball(self, name: str, centre: np.ndarray, radius_mm: float) -> None:
         """Draw a transparent ball around centre (3,) mm."""

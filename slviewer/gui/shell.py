@@ -55,9 +55,16 @@ from slviewer.wizard.snapshot import (
 STEPS_PX, STEP_PX = 160, 340
 """Widths of the two panels: at 1280 px of page, the scene keeps 60 % of it."""
 
-_ICONS = {"done": "circle-check", "ready": "circle-dotted", "blocked": "lock"}
-_STEP_COLOURS: dict[str, Literal["green", "gray"]] = {
+_DOUBTFUL = "done, with a warning"
+_ICONS = {
+    "done": "circle-check",
+    _DOUBTFUL: "alert-triangle",
+    "ready": "circle-dotted",
+    "blocked": "lock",
+}
+_STEP_COLOURS: dict[str, Literal["green", "orange", "gray"]] = {
     "done": "green",
+    _DOUBTFUL: "orange",
     "ready": "gray",
     "blocked": "gray",
 }
@@ -194,8 +201,9 @@ class Shell(ControlGroup):
         self._start_button.color = None if key == START else "gray"
         for step in snapshot.steps:
             button = self._step_buttons[step.key]
-            button.icon = viser.IconName(_ICONS[step.state])
-            button.color = None if step.key == key else _STEP_COLOURS[step.state]
+            state = _describe_state(step)
+            button.icon = viser.IconName(_ICONS[state])
+            button.color = None if step.key == key else _STEP_COLOURS[state]
         self._draw_heading(snapshot)
         self._draw_progress(snapshot)
         self._draw_session(snapshot)
@@ -242,8 +250,8 @@ class Shell(ControlGroup):
         steps = list(snapshot.steps)
         at = next(i for i, step in enumerate(steps) if step.key == self._shown_key)
         step = steps[at]
-        tone: Tone = "good" if step.state == "done" else "warning"
-        state = "" if step.state == "ready" else coloured(step.state, tone)
+        tone: Tone = "good" if step.state == "done" and not step.is_doubtful else "warning"
+        state = "" if step.state == "ready" else coloured(_describe_state(step), tone)
         link = help_link(step.key, STEPS_PAGE, _HELP_STYLE)
         heading = paragraph(
             Html(
@@ -353,6 +361,11 @@ class Shell(ControlGroup):
             self._operator.cancel()
         else:
             self._operator.start_autopilot(Autopilot(self._operator, pause_s=0.5))
+
+
+def _describe_state(step: StepView) -> str:
+    """Return the state of a step in words."""
+    return _DOUBTFUL if step.is_doubtful else step.state
 
 
 def next_step(snapshot: Snapshot) -> str:

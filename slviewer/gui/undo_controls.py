@@ -12,6 +12,7 @@ _VIEW = {
     "O": "Orthographic view, on or off",
     "Ctrl+K": "Search all commands",
     "Left drag": "Turn the view, or draw the shape that is to be selected",
+    "Left drag of a mark": "In Measure, move the point over the surface",
     "Shift, left drag": "Take points away from the selection",
     "Ctrl, left drag": "Turn the view while shapes are drawn",
     "Right drag, wheel": "Move the view, zoom",

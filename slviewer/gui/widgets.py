@@ -228,8 +228,9 @@ def help_link(anchor: str, page: str = FINDINGS_PAGE, style: str = "") -> Html:
     )
 
 
-def thumbnail(jpeg: bytes, width_px: int, alt: str) -> Html:
-    """Return a small picture inside HTML; an empty box where there is no JPEG yet."""
+def thumbnail(jpeg: bytes, width_px: int, alt: str, frame: str = "") -> Html:
+    """Return a small picture inside HTML; an empty box where there is no JPEG yet. ``frame``: the
+    attributes by which the page reads the pixels of the whole frame."""
     height = round(0.75 * width_px)
     if not jpeg:
         style = (
@@ -241,7 +242,7 @@ def thumbnail(jpeg: bytes, width_px: int, alt: str) -> Html:
     style = f"width:{width_px}px;height:{height}px;object-fit:cover;border-radius:4px;display:block"
     source = f"data:image/jpeg;base64,{data}"
     # enlarged by `image_lens.js`
-    return Html(f'<img alt="{to_html(alt)}" data-zoom="" src="{source}" style="{style}">')
+    return Html(f'<img alt="{to_html(alt)}" data-zoom="" {frame} src="{source}" style="{style}">')
 
 
 def meter(share: float) -> Html:

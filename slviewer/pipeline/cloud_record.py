@@ -45,6 +45,12 @@ def cloud_record(
     arrays["extrapolated"] = beyond
     known = {name: array for name, array in arrays.items() if array is not None}
     left = cloud.sigma_calibration
+    if store.load_capture(settings.capture).role == "calibration":
+        masked = masked_share(model, phase, region)
+    elif isinstance(model, SplinedModel):  # the cloud has all points
+        masked = 0.0 if beyond is None else _share(beyond, whole.mask, region)
+    else:
+        masked = None
     record = Reconstruction(
         operation="reconstruct",
         settings=plain_settings(settings),
@@ -59,7 +65,7 @@ def cloud_record(
         extrapolated_mm=None if beyond is None else _median(whole.sigma[beyond]),
         raised=model.residuals_over_noise(cloud.axis) if isinstance(model, SplinedModel) else 1.0,
         misfit_px=None if cloud.misfit is None else float(cloud.misfit.excess_px.max()),
-        masked=masked_share(model, phase, region),
+        masked=masked,
         depths=check_depths(store, cloud),
         frame=frame_of(store, cloud.model),
         **describe_calibration(store, cloud.model, [settings.capture]),
@@ -80,9 +86,14 @@ def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None) -> fl
     if not isinstance(model, SplinedModel):
         return None
     every = np.isfinite(model.points(phase, supported=False)[..., 2])
+    return _share(~model.support(phase), every, region)
+
+
+def _share(chosen: np.ndarray, every: np.ndarray, region: np.ndarray | None) -> float:
+    """Return the share of ``chosen`` pixels among ``every`` one, in the ``region`` if given."""
     if region is not None:
-        every &= region
-    return float(1 - model.support(phase)[every].mean()) if every.any() else 0.0
+        every = every & region
+    return float(chosen[every].mean()) if every.any() else 0.0
 
 
 def check_depths(store: Session, cloud: Cloud) -> DepthCheck | None:

@@ -420,10 +420,10 @@ class ExportSettings(Callbacks):
 
     Args:
         session: Session folder.
-        what: cloud and mesh of a scan; merge (the points) and merged-mesh; calibration for OpenCV
-            or as JSON; coefficients of each pixel as .npz; poses of camera, projector, target and
-            scans as 4x4 matrices; report as HTML; table of the figures of verifications, clouds and
-            merges as CSV.
+        what: cloud and mesh of a scan, without extrapolated points; merge (the points) and
+            merged-mesh; calibration for OpenCV or as JSON; coefficients of each pixel as .npz;
+            poses of camera, projector, target and scans as 4x4 matrices; report as HTML; table of
+            the figures of verifications, clouds and merges as CSV.
         name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model
             of coefficients.
         out: The file, whose suffix selects the format, or a folder; by default the session's

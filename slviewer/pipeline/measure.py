@@ -87,10 +87,11 @@ class MeasureSettings:
         accept_rejected: Use the calibration although its verdict rejects it.
 
     Python alone: ``axes``, three unit vectors that the sides of the box lie along, and its corners
-    are given in; ``load`` returns the surface where it is at hand.
+    are given in; ``load`` returns the surface where it is at hand; ``replaces``: the measurement
+    whose place it takes.
     """
 
-    UNRECORDED: ClassVar = ("name", "load")
+    UNRECORDED: ClassVar = ("name", "load", "replaces")
     scan: str
     what: What
     at: Sequence[int] = ()
@@ -102,6 +103,7 @@ class MeasureSettings:
     accept_rejected: bool = False
     axes: Sequence[Sequence[float]] = ()
     load: LoadSurface | None = None
+    replaces: str = ""
 
     def __post_init__(self) -> None:
         if self.what in FITTED and (len(self.ball), len(self.box)) not in ((4, 0), (0, 6)):
@@ -163,7 +165,7 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
     )
     used = replace(settings, model=on.model)  # type: ignore[arg-type]
     notes = uncertainty_notes(store, record)
-    yield Found("", record, arrays, notes=notes, settings=used)
+    yield Found(settings.replaces, record, arrays, notes=notes, settings=used)
     job.progress(1.0, "measured")
 
 

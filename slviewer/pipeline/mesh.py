@@ -142,7 +142,7 @@ class MeshSettings(Callbacks):
 @takes_settings(MeshSettings)
 def mesh(settings: MeshSettings) -> MeshResult:
     """Make a mesh of a scan, or of several that are merged, and write it as .ply, .stl, .obj or
-    .glb.
+    .glb. Extrapolated points are not used.
 
     ``merge/`` alone is the session's last merge. The points of merged scans are written next to the
     mesh.

@@ -508,7 +508,7 @@ def restore(session: SessionLike, names: Sequence[str] = ()) -> str:
                 latest[name] for name in found if name in names or name == latest[name].name
             )
         )
-        store.restore(chosen)
+        store.exchange({each.name: each.place for each in chosen})
         return "\n".join(
             f"restored: {each.name}, deleted {each.time:%Y-%m-%d %H:%M:%S} UTC" for each in chosen
         )

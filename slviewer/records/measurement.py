@@ -327,6 +327,13 @@ class Measurement(Record, frozen=True, kw_only=True):
         """Return the name that it was given when it was made, or its kind and number."""
         return self.name or f"{self.what} {name.removeprefix(self.prefix)}"
 
+    def places(self) -> list[Any]:
+        """Return the places that it was measured at: pixels (u, v) of a scan, numbers of points of
+        a merge; empty for others."""
+        at = self.settings.get("at", ())
+        ends = 1 if self.what == "point" else 2
+        return list(at) if len(at) == ends else list(zip(at[::2], at[1::2], strict=False))
+
     def __getitem__(self, name: str) -> Quantity:
         """Return the quantity of that name, such as "diameter". Raises InputError for others."""
         for quantity in self.quantities:

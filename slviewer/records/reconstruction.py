@@ -153,7 +153,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             yield (
                 f"{self.extrapolated:,} more points are extrapolated, as no target pose illuminated"
                 f" what they look through: their sigma is {self.extrapolated_mm:.3f} mm in the"
-                " median. Merges and measurements do not use them"
+                " median. Merges, measurements, meshes and exported clouds are without them"
             )
         if (i := self.imported) is not None:
             yield "; ".join((f"from {i.file} in {i.unit}", i.normals, i.sigma, *i.notes))

@@ -43,6 +43,7 @@
     shape = null;
     svg.remove();
   };
+  window.__sendToServer = (message) => worker?.postMessage({ type: "send", message });
   const send = (drawn) => {
     const { kind, box, modifier } = drawn;
     const places = outline(drawn).map(([x, y]) => [(x - box.left) / box.width, (y - box.top) / box.height]);
@@ -50,7 +51,7 @@
     while (kind === "brush" && places.length < 3) places.push(places[0]);
     if (places.length < 3) return;
     const pointer = { event_type: "rect-select", ray_origin: null, ray_direction: null, screen_pos: places, modifier };
-    worker?.postMessage({ type: "send", message: { type: "ScenePointerMessage", ...pointer } });
+    window.__sendToServer({ type: "ScenePointerMessage", ...pointer });
   };
 
   // Each returns whether nothing else is to handle the event.

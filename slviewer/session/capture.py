@@ -94,6 +94,20 @@ class Capture:
             )
 
     @property
+    def brightest_frame(self) -> int:
+        """The index of the frame that shows the scene best: a texture, else a white one."""
+        ranks: dict[str, int] = {"texture": 0, "white": 1, "phase": 2, "gray": 3}
+        frames = self.sequence.frames
+        return min(range(len(frames)), key=lambda k: ranks.get(frames[k].kind, 9))
+
+    def frame_file(self, index: int) -> tuple[Path, int]:
+        """Return the file that begins with the pixels of a frame, row by row and little-endian, and
+        the bytes of a pixel. Raises as `stack`."""
+        self.require_frames("show")
+        stored = FrameStack.open(self.folder / "frames.zarr")
+        return stored.chunk_path(index), stored.dtype.itemsize
+
+    @property
     def frames(self) -> np.ndarray:
         """All frames (n, h, w), uint8 or uint16, in the sequence's order; read anew at every
         access."""

@@ -54,9 +54,9 @@ class Session(Decisions):
         self._allow: Callable[[], None] | None = None
         self._created: Literal["", "session", "folder"] = ""  # what this object made
         self._together: atomic.Together | None = None
-        self.recovered: tuple[
-            str, ...
-        ] = ()  # captures that a writer died before it could finish, completed on opening
+        self._kept: dict[str, Path | None] | None = None  # of `keep_replaced`
+        self._kinds: tuple[str, ...] = ()
+        self.recovered: tuple[str, ...] = ()  # captures of a dead writer, completed on opening
 
     # opening and closing
 
@@ -290,39 +290,54 @@ class Session(Decisions):
         atomic.move(folder, target)
         return target
 
-    def deleted_captures(self, role: Role | None = None) -> list[str]:
-        """Names of the captures in the trash that `restore_last` can bring back, the last deleted
-        first."""
-        names = list[str]()
-        for each in self.trashed():
-            if (
-                each.is_capture
-                and each.name not in names
-                and not self._capture_folder(each.name).exists()
-            ):
-                with contextlib.suppress(DamagedError):
-                    if role is None or read_capture(each.place).role == role:
-                        names.append(each.name)
-        return names
-
     def trashed(self) -> list[Trashed]:
         """Return what is in the trash and complete, the last deleted first."""
         return list_trash(self.folder / "trash")
 
-    def _place_of(self, entry: Trashed) -> Path:
-        """Return the place of a capture or result that is in the trash."""
-        return (self._capture_folder if entry.is_capture else self._result_folder)(entry.name)
+    def _place_of(self, name: str) -> Path:
+        """Return the folder of a capture or result."""
+        if "/" not in name:
+            return self._capture_folder(name)
+        return locate_result(self.folder / "results", name)
 
-    def restore(self, entries: Iterable[Trashed]) -> None:
-        """Bring captures and results back from the trash, in one step; what has their names now
-        takes their places."""
+    def exchange(self, contents: Mapping[str, Path | None]) -> dict[str, Path | None]:
+        """Replace captures and results {name: its place in the trash, or None to remove it} in one
+        step.
+
+        Returns the same of what they replaced, which exchanges them back. InputError where one is
+        no longer there.
+        """
         self._require_writer()
-        changes = atomic.Together(self.folder)
-        for each in entries:
-            target = self._place_of(each)
+        changes, replaced = atomic.Together(self.folder), dict[str, Path | None]()
+        for name, place in contents.items():
+            target = self._place_of(name)
+            if not (place or target).is_dir():
+                where = "in the session" if place is None else "in its trash"
+                raise InputError(f"{name} is no longer {where}")
             target.parent.mkdir(parents=True, exist_ok=True)
-            changes.replace(target, each.place, self._trash_place(target))
+            replaced[name] = self._trash_place(target) if target.exists() else None
+            changes.replace(target, place, replaced[name])
         changes.commit()
+        return replaced
+
+    @contextmanager
+    def keep_replaced(self, *kinds: str) -> Iterator[dict[str, Path | None]]:
+        """Context manager: results of these kinds that are replaced in it go to the trash. Gives
+        what `exchange` reverses it with, complete at its end. For one thread."""
+        kept = self._kept = dict[str, Path | None]()
+        self._kinds = kinds
+        try:
+            yield kept
+        finally:
+            self._kept = None
+
+    def _keep(self, name: str) -> Path | None:
+        """Return where in the trash the result goes that is replaced; None: it is deleted."""
+        if self._kept is None or name in self._kept or name.partition("/")[0] not in self._kinds:
+            return None
+        target = self._place_of(name)
+        place = self._kept[name] = self._trash_place(target) if target.exists() else None
+        return place
 
     def restore_last(self, name: str) -> None:
         """Bring the last deleted capture or result of that name back. InputError without one, or
@@ -332,9 +347,9 @@ class Session(Decisions):
             raise InputError(
                 f"there is no deleted {'result' if '/' in name else 'capture'} {name!r}"
             )
-        if self._place_of(found).exists():
+        if self._place_of(name).exists():
             raise InputError(f"there is a {name!r} again: delete that one first")
-        self.restore([found])
+        self.exchange({name: found.place})
 
     # results
 
@@ -356,6 +371,8 @@ class Session(Decisions):
             self._require_writer()
         except BaseException:
             changes.discard()
+            if self._kept is not None:
+                self._kept.clear()
             raise
         finally:
             self._together = None
@@ -392,10 +409,11 @@ class Session(Decisions):
         with atomic.staged_folder(target, size) as staged:
             write_result(staged, meta, checked)
             self._require_writer()
+        old_to = self._keep(name)
         if self._together is None:
-            atomic.commit(staged, target)
+            atomic.commit(staged, target, old_to)
         else:
-            self._together.replace(target, staged)
+            self._together.replace(target, staged, old_to)
 
     def load_result(
         self, name: str, only: Collection[str] | None = None
@@ -432,7 +450,7 @@ class Session(Decisions):
         self._require_writer()
         self.load_result(name, only=())
         folder = self.folder / "results" / name
-        target = self._trash_place(folder)
+        target = self._keep(name) or self._trash_place(folder)
         if self._together is None:
             atomic.move(folder, target)
         else:
@@ -469,11 +487,8 @@ class Session(Decisions):
         folder = self._result_folder(name)
         if name in known or not (folder / "meta.json").is_file():
             return known.get(name, "absent")
-        # while it is examined, or if that fails
-        inputs, known[name] = (
-            read_meta(folder).get("inputs", {}),
-            "stale",
-        )
+        inputs = read_meta(folder).get("inputs", {})
+        known[name] = "stale"  # while it is examined, or if that fails
         with contextlib.suppress(DamagedError, InputError):
             for other, used in inputs.items():
                 changed = used not in (self._hashes(other) or [""]) or depth == _MAX_INPUTS_CHAIN

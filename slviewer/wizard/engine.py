@@ -46,7 +46,7 @@ from slviewer.wizard.snapshot import (
     WorldView,
 )
 from slviewer.wizard.steps import views
-from slviewer.wizard.undo_history import Step, UndoHistory
+from slviewer.wizard.undo_history import Step, UndoHistory, exchange_step
 
 READ_ATTEMPTS = 20
 """Snapshots in a row that may meet the session's files in the middle of a change."""
@@ -240,16 +240,25 @@ class Engine:
         section: str = "",
         failed: Callable[[BaseException], None] | None = None,
         finish: Callable[[Findings[Any]], None] | None = None,
+        change: str = "",
     ) -> None:
         """Queue an operation as `_work`. A calibration that the operator uses although it was
-        rejected is used."""
+        rejected is used. ``change``: the name under which its results can be undone."""
+        opened = self._store
 
         def work(job: Job) -> Findings[Any]:
             """Run the operation."""
             used = settings
             if accepts_rejected(job.store) and hasattr(settings, "accept_rejected"):
                 used = replace(settings, accept_rejected=True)
-            return operation.run(job.store, used, job.progress, job.warn)
+            if not change:
+                return operation.run(job.store, used, job.progress, job.warn)
+            with job.store.keep_replaced(operation.record.kind, "verdict") as replaced:
+                try:
+                    return operation.run(job.store, used, job.progress, job.warn)
+                finally:  # a rejected calibration is saved too
+                    if replaced:
+                        self._add_change(opened, change, exchange_step(opened, replaced))
 
         self._work(title, work, section, failed, finish)
 
@@ -268,9 +277,9 @@ class Engine:
         if reader is None:
             return
         target, captures = reader.target(), reader.session.captures()
-        there = {capture.name for capture in captures}
-        with self._lock:  # a deleted capture that is restored is processed again
-            self._queued = {key for key in self._queued if key[0] in there}
+        there = {(capture.name, capture.hash) for capture in captures}
+        with self._lock:  # a deleted or retaken capture that is restored is processed again
+            self._queued = {key for key in self._queued if key[:2] in there}
         for capture in captures:
             key = (capture.name, capture.hash, target)
             with self._lock:

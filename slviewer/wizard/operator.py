@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ from slviewer.wizard.result_requests import ResultRequests
 from slviewer.wizard.rig_requests import RigRequests
 from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import PreviewView, Snapshot
+from slviewer.wizard.undo_history import combine, decide_step, exchange_step
 
 IMPORTING = "Importing"
 BOARD_S = 10.0
@@ -217,7 +219,10 @@ class Operator(RigRequests, ResultRequests):
             """Save the captured frames as a target pose; a retaken pose is included again."""
             save_frames(store, name, "pose", captured, board=target, force=bool(retaken))
             if retaken:
-                store.include(name)
+                before = next(each.place for each in store.trashed() if each.name == name)
+                exclude = decide_step(store, "excluded", partial(store.include, name))()
+                back = combine(exclude, exchange_step(store, {name: before}))
+                self._add_change(store, f"retake {self._label(name)}", back)
             self._queue_processing()
 
         self._queue_capture(name, self._pose_sequence(), save)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -47,10 +47,10 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
-from slviewer.pipeline.stored_records import load_record
+from slviewer.pipeline.stored_records import load_record, load_stored
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.measurement import MeasuredRegion
+from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused
@@ -96,7 +96,7 @@ class ResultRequests(ChangeRequests):
             before = load_record(self._store, ModelCalibration, "stereo").settings
         known = {key: before[key] for key in ("camera", "fix_camera") if key in before}
         settings = CalibrateSettings(target, models, replace_all=True, **known)
-        self._run("Calibrating", calibrate, settings, "calibration")
+        self._run("Calibrating", calibrate, settings, "calibration", change="calibrate")
 
     @request("Comparing the models")
     def compare_models(self) -> None:
@@ -137,7 +137,8 @@ class ResultRequests(ChangeRequests):
         """Align reconstructed scans to those in place; without names all that were not aligned
         yet."""
         settings = AlignSettings(self._check_names(names), only_reconstructed=True)
-        self._run("Aligning", align, settings, "merge")
+        labels = " ".join(["align", ", ".join(map(self._label, names))]).strip()
+        self._run("Aligning", align, settings, "merge", change=labels)
 
     def _check_names(self, names: Sequence[str]) -> list[str]:
         """Return names of captures. Raises InputError for one that does not exist."""
@@ -308,6 +309,22 @@ class ResultRequests(ChangeRequests):
         chosen["at"] = [int(number) for number in np.ravel(at)] if len(at) else ()
         settings = MeasureSettings(on, what, **chosen, load=partial(surface_to_measure, name=on))
         self._run(MEASURING, measure, settings, "measurements", finish=self._finish("measure"))
+
+    @request(MEASURING)
+    def move_point(self, name: str, end: int, place: Place) -> None:
+        """Measure again with one of the points of a measurement, from 0, at another place of its
+        surface."""
+        before = load_stored(self._store, Measurement, name)
+        on, at = before.record.source, before.record.places()
+        if before.stale or not at:
+            raise InputError(f"{before.label} has no points on its surface: measure again")
+        at[end] = place
+        settings = MeasureSettings(
+            on, cast(Tool, before.record.what), [int(number) for number in np.ravel(at)],
+            name=before.record.name, load=partial(surface_to_measure, name=on), replaces=name,
+        )  # fmt: skip
+        change = f"move a point of {before.label}"
+        self._run(MEASURING, measure, settings, "measurements", change=change)
 
     @request(MEASURING)
     def measure_between(self, a: str, b: str) -> None:

@@ -157,10 +157,7 @@ def pixel_curve(session: Session, pixel: tuple[int, int], axis: Axis) -> PixelCu
 def make_thumbnail(capture: Capture) -> bytes:
     """Return a small JPEG of the capture's texture, or of its brightest kind of frame where it has
     none."""
-    ranks: dict[str, int] = {"texture": 0, "white": 1, "phase": 2, "gray": 3}
-    frames = capture.sequence.frames
-    index = min(range(len(frames)), key=lambda k: ranks.get(frames[k].kind, 9))
-    image = capture.stack([index])[0]
+    image = capture.stack([capture.brightest_frame])[0]
     choice = capture.exposure_choice
     if choice is not None:
         image = toned(radiance(image, choice, capture.exposures_ms))
@@ -205,6 +202,13 @@ def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> 
     index = nearest(on.points, origin, direction)
     if index is None:
         return None
+    return (index[1], index[0]) if on.organised else index[0]
+
+
+def snap(on: MeasuredSurface, point: np.ndarray) -> Place:
+    """Return the place of the measured point closest to a point (3,) mm."""
+    off = ((on.points - point) ** 2).sum(axis=-1)
+    index = [int(i) for i in np.unravel_index(np.nanargmin(off), off.shape)]
     return (index[1], index[0]) if on.organised else index[0]
 
 

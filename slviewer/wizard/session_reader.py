@@ -33,7 +33,7 @@ from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Placement
 from slviewer.records.reconstruction import Reconstruction
-from slviewer.session.capture import Capture
+from slviewer.session.capture import Capture, Role, read_capture
 from slviewer.session.inspection_plan import list_plans
 from slviewer.session.names import join_names
 from slviewer.session.nominal import NOMINALS
@@ -162,8 +162,8 @@ class SessionReader:
             region=self._attempt("the region", load_region, session, even_if_off=True),
             region_is_on=bool((session.valid_decision("region") or {}).get("on")),
             report_details=session.report_details(),
-            deleted_poses=tuple(session.deleted_captures("calibration")),
-            deleted_scans=tuple(session.deleted_captures("scan")),
+            deleted_poses=_list_deleted(session, "calibration"),
+            deleted_scans=_list_deleted(session, "scan"),
             faults=tuple(dict.fromkeys(self._faults)),
         )
 
@@ -390,6 +390,17 @@ def _make_features(
     return PoseFeatures(
         points, camera, projector, float(np.median(known)) if known.size else np.nan
     )
+
+
+def _list_deleted(session: Session, role: Role) -> tuple[str, ...]:
+    """Return the names of the captures of a role that can be restored, the last deleted first."""
+    used, names = session.taken_names(), list[str]()
+    for each in session.trashed():
+        if each.is_capture and each.name not in (*used, *names):
+            with suppress(DamagedError):
+                if read_capture(each.place).role == role:
+                    names.append(each.name)
+    return tuple(names)
 
 
 def missing_for_splined(session: Session) -> str:

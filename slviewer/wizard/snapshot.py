@@ -220,8 +220,8 @@ class ExportView:
 
 @dataclass(frozen=True)
 class StepView:
-    """One step: its `instruction`, its `problems` with their remedies, and `blocked_by`: why it
-    cannot be done yet."""
+    """One step: its `instruction`, its `problems` with their remedies, `blocked_by`: why it cannot
+    be done yet, and `is_doubtful`: whether it is done, with problems of its results."""
 
     key: str
     title: str
@@ -229,6 +229,7 @@ class StepView:
     state: StepState
     blocked_by: str
     problems: tuple[str, ...]
+    is_doubtful: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,12 +32,13 @@ what is wrong, and how to correct it."""
 
 def views(now: Snapshot) -> tuple[StepView, ...]:
     """Evaluate every step for the panels: its state, instruction and problems."""
-    made = []
+    made, passing = [], set(_device_problems(now))
     for key, look in STEPS.items():
         blocked, done, instruction, problems = look(now)
         state: StepState = "blocked" if blocked else "done" if done else "ready"
         title = key.capitalize()
-        made.append(StepView(key, title, instruction, state, blocked, tuple(problems)))
+        doubtful = state == "done" and not passing.issuperset(problems)
+        made.append(StepView(key, title, instruction, state, blocked, tuple(problems), doubtful))
     return tuple(made)
 
 

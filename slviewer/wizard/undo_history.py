@@ -106,25 +106,16 @@ def decide_step(store: Session, what: str, change: Callable[[], object]) -> Step
     return act
 
 
+def exchange_step(store: Session, contents: Mapping[str, Path | None]) -> Step:
+    """Return the step that `Session.exchange` makes of captures and results {name: place in the
+    trash}; the reverse exchanges them back."""
+    contents = dict(contents)
+    return lambda: exchange_step(store, store.exchange(contents))
+
+
 def trash_step(store: Session, names: Iterable[str]) -> Step:
-    """Return the step that moves captures, and results such as ``merge/1``, to the trash. The
-    reverse brings just these back; what has their names by then is moved to the trash."""
-    names = list(names)
-
-    def act() -> Step:
-        """Move them to the trash."""
-        places = [(store.trash_result if "/" in n else store.trash_capture)(n) for n in names]
-        return partial(restore, places)
-
-    def restore(places: list[Path]) -> Step:
-        """Bring them back."""
-        entries = [each for each in store.trashed() if each.place in places]
-        if len(entries) < len(places):
-            raise InputError("it is no longer in the session's trash")
-        store.restore(entries)
-        return act
-
-    return act
+    """Return the step that moves captures, and results such as ``merge/1``, to the trash."""
+    return exchange_step(store, dict.fromkeys(names))
 
 
 def restore_step(store: Session, name: str) -> Step:

@@ -42,3 +42,11 @@ def test_a_command_has_the_arguments_that_its_functions_docstring_describes(
         merge["captures"].annotation.__origin__ == tuple[str, ...]
         and merge["model"].default is None
     )
+
+
+@pytest.mark.parametrize("command", ["export", "mesh"])
+def test_help_says_that_extrapolated_points_are_omitted(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, "--help"]) == 0
+    assert "xtrapolated" in capsys.readouterr().out

@@ -136,8 +136,12 @@ def test_live_scan_and_board_in_view_are_compared_with_the_calibrated_depths(
 
 
 def test_extrapolated_points_are_marked_in_files_and_used_by_nothing_else(
-    recorded: Path, tmp_path: Path, run: Run
+    recorded: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def evaluate_again(*_: object) -> None:
+        raise AssertionError("the depths are evaluated again")
+
+    monkeypatch.setattr("slviewer.pipeline.cloud_record.masked_share", evaluate_again)
     folder = copy_session(recorded / "session", tmp_path / "session")
     path = tmp_path / "all.ply"
     assert run("reconstruct", folder, "plane_01", "--out", path)[0] == 0
@@ -148,6 +152,7 @@ def test_extrapolated_points_are_marked_in_files_and_used_by_nothing_else(
     ply = read_ply(path)
     assert record.extrapolated == stored.sum() == ply.scalars["extrapolated"].sum() > 100
     assert record.points + record.extrapolated == len(ply.points)
+    assert record.masked == pytest.approx(record.extrapolated / len(ply.points), rel=1e-9)
     assert record.extrapolated_mm is not None and record.sigma_calibration_mm is not None
     assert record.extrapolated_mm > 1.5 * record.sigma_calibration_mm
     assert cloud.extrapolated is None and np.count_nonzero(cloud.mask) == record.points

@@ -1,7 +1,10 @@
 """The lens over the live image states the camera's pixel and the grey level under the pointer."""
 
+import base64
 import re
 
+import numpy as np
+import pytest
 from playwright.sync_api import Browser, expect
 
 from slviewer.server.viser_internals import PAGE_SCRIPT
@@ -19,6 +22,30 @@ PAGE = """<body style="margin:0"><div><div data-live="small" data-camera-px="128
   fill("rgb(255,0,80)", 240, 60, 40, 40);
   for (const image of document.images) image.src = canvas.toDataURL();
 </script>"""
+
+
+@pytest.mark.parametrize("dtype", ["<u1", "<u2"])
+def test_the_lens_reads_the_pixels_of_the_stored_frame(browser: Browser, dtype: str) -> None:
+    page = browser.new_page()
+    page.set_content(PAGE % PAGE_SCRIPT.decode())
+    frame = np.arange(240 * 320).reshape(240, 320).astype(dtype)
+    content = base64.b64encode(frame.tobytes() + b"crc.").decode()
+    page.locator("#small").evaluate(
+        """(image, given) => Object.assign(image.dataset, given)""",
+        {
+            "frame": f"data:application/octet-stream;base64,{content}",
+            "width": "320",
+            "bytes": str(frame.itemsize),
+        },
+    )
+    page.locator("#small").hover()
+    x, y = 160, 120  # its middle; 4 px of the frame are one of the page
+    lens = page.locator("#image-lens")
+    expect(lens).to_have_text(re.compile(r"^x 1\d\d, y 1\d\d px: grey level \d+$"))
+    found = [int(each) for each in re.findall(r"\d+", lens.inner_text())]
+    assert abs(found[0] - x) <= 4 and abs(found[1] - y) <= 4
+    assert found[2] == frame[found[1], found[0]]
+    page.close()
 
 
 def test_the_lens_states_pixel_and_grey_level(browser: Browser) -> None:

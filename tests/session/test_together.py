@@ -120,6 +120,43 @@ def test_a_result_that_is_trashed_and_saved_again_is_in_the_trash_once(folder):
         assert session.load_result(NAMES[0])[0]["age"] == "new"
 
 
+def test_what_was_replaced_is_exchanged_back_and_forth(folder):
+    added = "verdict/other"
+    with Session.open(folder, write=True) as session:
+
+        def ages() -> dict[str, str]:
+            return {name: session.load_result(name)[0]["age"] for name in session.result_names()}
+
+        before = ages()
+        with session.keep_replaced("calibration", "verdict") as replaced:
+            save_new(session)
+            session.save_result(added, {"age": "new", "inputs": {}}, {})
+            session.save_result(added, {"age": "newer", "inputs": {}}, {})
+        after = ages()
+        assert replaced.keys() == {*before, added} and replaced[added] is None
+        assert after == dict.fromkeys(NAMES, "new") | {added: "newer"}
+        with (
+            session.keep_replaced("verdict") as given_up,
+            pytest.raises(InputError),
+            session.together(),
+        ):
+            session.save_result(added, {"age": "none", "inputs": {}}, {})
+            raise InputError("it cannot be made")
+        assert given_up == {} and ages() == after
+        with session.keep_replaced("merge") as of_others:
+            session.save_result(added, {"age": "newer", "inputs": {}}, {})
+        assert of_others == {}
+        for expected in (before, after, before):
+            replaced = session.exchange(replaced)
+            assert ages() == expected
+        (folder / "trash").rename(folder / "lost")
+        with pytest.raises(InputError, match=added):
+            session.exchange({NAMES[0]: None, added: None})
+        with pytest.raises(InputError, match=NAMES[0]):
+            session.exchange(replaced)
+        assert ages() == before  # all or nothing
+
+
 @pytest.mark.parametrize(
     "listed",
     [

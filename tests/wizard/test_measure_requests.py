@@ -27,7 +27,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.result_views import place_at, point_at, surface_to_measure
+from slviewer.wizard.result_views import place_at, point_at, snap, surface_to_measure
 from slviewer.wizard.snapshot import SessionView
 
 pytestmark = pytest.mark.computes
@@ -132,6 +132,36 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
         "diameter",
         "distance of the centres",
     }
+
+
+@pytest.mark.slow
+def test_a_point_is_moved_under_the_names_of_its_measurement(operator: Operator) -> None:
+    on = operator.surface("balls")
+    a, b, c = (place_at(on, np.zeros(3), CENTRES[i] + [x, 0, -RADIUS]) for i, x in
+               ((0, 0), (1, 0), (1, 8)))  # fmt: skip
+    assert a and b and c
+    assert operator.measure("balls", "distance", [a, b]) and operator.measure("balls", "point", [b])
+    *_, width, point = now(operator).measurements
+    assert operator.measure_between(point.name, point.name)  # refused; nothing to undo is added
+    assert operator.relabel_measurement(width.name, "Width")
+    before = {each.name: each.record for each in now(operator).measurements}
+
+    assert snap(on, point_at(on, c) + 0.01) == c
+    assert operator.move_point(width.name, 1, c)
+    after = {each.name: each.record for each in now(operator).measurements}
+    moved = after.pop(width.name)
+    assert operator.snapshot().next_undo == "move a point of Width"
+    assert moved.ends is not None and moved.places() == [a, c]
+    np.testing.assert_allclose(moved.ends[1], point_at(on, c))
+    apart = float(np.linalg.norm(point_at(on, a) - point_at(on, c)))
+    assert moved.quantities[0].value == pytest.approx(apart, abs=1e-3)
+    assert {**after, width.name: before[width.name]} == before
+    assert next(e for e in now(operator).measurements if e.name == width.name).label == "Width"
+    assert operator.undo()
+    assert {each.name: each.record for each in now(operator).measurements} == before
+    assert operator.redo()
+    assert {each.name: each.record for each in now(operator).measurements}[width.name] == moved
+    assert not operator.move_point("m77", 0, a)
 
 
 def test_what_cannot_be_measured_is_said_and_nothing_kept(operator: Operator) -> None:

@@ -232,6 +232,9 @@ def test_scans_are_aligned_as_they_come_and_merged_from_there(operator: Operator
     assert operator.merge(NAMES, "first", start="placed")
     assert missing_facts(settled(operator)[0].merge_failure, "third", "aligned") == []
     assert operator.align("third") and settled(operator)[0].scan("third").placement.onto == "second"  # type: ignore[union-attr]
+    assert operator.snapshot().next_undo == "align third" and operator.undo()
+    assert settled(operator)[0].scan("third").placement is None  # type: ignore[union-attr]
+    assert operator.redo() and settled(operator)[0].scan("third").placement.onto == "second"  # type: ignore[union-attr]
     assert operator.delete("third") and operator.undelete("third")
     assert store.result_names().count("placement/third") == 0
     assert operator.set_align_scans(False)

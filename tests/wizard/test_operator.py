@@ -130,9 +130,17 @@ def test_poses_are_judged_kept_and_found_again(
         )  # type: ignore[union-attr]
         # what was decided can be undone, retaken, deleted
         assert again.include("pose_02") and again.delete("pose_03")
+        assert again.session is not None
+        first = again.session.load_capture("pose_01").hash
         assert again.place_at_suggestion() and again.retake_pose("pose_01")
         retaken = again.wait_until_idle()
         assert states(retaken) == {"pose_01": "good", "pose_02": "good"}
+        assert retaken.next_undo == "retake <b>first</b>"
+        new = again.session.load_capture("pose_01").hash
+        assert again.undo() and states(again.wait_until_idle()) == states(retaken)
+        assert again.session.load_capture("pose_01").hash == first
+        assert again.redo() and states(again.wait_until_idle()) == states(retaken)
+        assert again.session.load_capture("pose_01").hash == new != first
         assert len(list((tmp_path / "session" / "trash").iterdir())) >= 2
         # another target: what was judged by the old one is judged anew
         assert again.choose_target("circles:20x16:9")

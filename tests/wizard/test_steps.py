@@ -10,6 +10,7 @@ from slviewer.calibration.next_pose import Coverage, nominal_lens
 from slviewer.calibration.stereo import MIN_POSES, StereoModel
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture import Space
+from slviewer.records.reconstruction import DepthCheck, Reconstruction
 from slviewer.target.board import Board
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 from slviewer.wizard.snapshot import (
@@ -17,6 +18,7 @@ from slviewer.wizard.snapshot import (
     CalibrationView,
     PoseView,
     RigView,
+    ScanView,
     SessionView,
     Snapshot,
 )
@@ -112,6 +114,21 @@ def test_the_way_through_the_wizard() -> None:
         )
         == []
     )
+
+
+def test_a_scan_outside_the_calibrated_depths_leaves_its_step_doubtful() -> None:
+    def scan(name: str, outside: float) -> ScanView:
+        depths = DepthCheck((400.0, 600.0), outside, 610.0, 700.0, 0.1, True)
+        figures = Reconstruction(model="splined", axis="x", points=900, depths=depths)
+        return ScanView(name, name, "scan", "", "fresh", figures, b"")
+
+    session = replace(EMPTY, target="circles:9x7:20", poses=poses(10), calibration=calibration())
+    inside = replace(session, scans=(scan("one", 0.0),))
+    both = replace(session, scans=(scan("one", 0.0), scan("two", 0.9)))
+    for facts, doubtful in ((inside, False), (both, True)):
+        view = next(v for v in views(seen(facts, OPEN, None, "saturated")) if v.key == "scan")
+        assert (view.state, view.is_doubtful) == ("done", doubtful)
+    assert missing_facts(view.problems[-1], "two", "calibrated depths") == []
 
 
 def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:

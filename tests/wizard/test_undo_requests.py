@@ -11,13 +11,16 @@ import pytest
 from facts import missing_facts
 from wizard_events import HANG_S
 
-from slviewer.errors import InputError, SessionError
+from slviewer.errors import CalibrationRejected, InputError, SessionError
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.edit import Selection
+from slviewer.pipeline.operation import Findings
+from slviewer.records.calibration import ModelCalibration
 from slviewer.session.scan_edits import list_edits, load_edits
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
+from slviewer.wizard import result_requests
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.undo_history import Step, UndoHistory
 
@@ -143,10 +146,11 @@ def test_a_deleted_capture_comes_back_although_another_took_its_name(operator: O
     add_capture(store, "scan_03", 9)
     other = store.load_capture("scan_03").hash
     assert operator.undo() and state(operator) == before
-    assert store.deleted_captures() == []  # the name is in use, but the other is in the trash
+    # the name is in use, but the other is in the trash
+    assert operator.wait_until_idle(HANG_S).content.deleted_scans == ()
     (trashed,) = (each for each in store.trashed() if each.is_capture)
     assert trashed.name == "scan_03"
-    store.restore([trashed])
+    store.exchange({trashed.name: trashed.place})
     assert store.load_capture("scan_03").hash == other
 
 
@@ -172,6 +176,52 @@ def test_edits_that_changed_since_are_left_alone(operator: Operator) -> None:
     assert not operator.undo()
     assert missing_facts(operator.notices()[-1].text, "scan_01") == []
     assert load_edits(store, "scan_01").edits[0].made == before
+
+
+def test_a_calibration_that_was_replaced_comes_back(
+    operator: Operator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = opened(operator)
+
+    def save(into: Session, name: str, content: str) -> None:
+        verdict = {"level": "good", "findings": []}
+        into.save_result(name, {"inputs": {}, "content": content, "verdict": verdict}, {})
+
+    def contents() -> dict[str, Any]:
+        names = [each for each in store.result_names() if not each.startswith("trust/")]
+        return {name: store.load_result(name)[0]["content"] for name in names}
+
+    class Calibrate:
+        """Stands for the operation: it replaces results, and raises for a rejected one."""
+
+        record = ModelCalibration
+        content = "new"
+
+        def run(self, into: Session, *_: object) -> Findings[Any]:
+            with into.together():
+                if into.has_result("verdict/other"):
+                    into.trash_result("verdict/other")
+                save(into, "verdict/1", self.content)
+            save(into, "evidence/1", self.content)
+            if self.content == "rejected":
+                raise CalibrationRejected("moved")
+            return Findings(ModelCalibration, {})
+
+    for name in ("verdict/1", "verdict/other"):
+        save(store, name, "old")
+    monkeypatch.setattr(result_requests, "calibrate", calibrate := Calibrate())
+    assert operator.choose_target("circles:9x7:20") and operator.calibrate()
+    assert names(operator) == ("calibrate", "")
+    after = {"verdict/1": "new", "evidence/1": "new"}
+    assert contents() == after
+    calibrate.content = "rejected"
+    assert operator.calibrate() and names(operator) == ("calibrate", "")
+    assert contents() == dict.fromkeys(after, "rejected")
+    after["evidence/1"] = "rejected"  # of other kinds stays
+    assert operator.undo() and contents() == after
+    assert operator.undo()
+    assert contents() == {"verdict/1": "old", "verdict/other": "old", "evidence/1": "rejected"}
+    assert operator.redo() and contents() == after
 
 
 def test_another_session_begins_without_a_history(operator: Operator, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.measurement import Measurement
 from slviewer.report.canvas import round_up
 from slviewer.session.nominal import MM, Units
-from slviewer.wizard.result_views import box_in_view, place_at, point_at
+from slviewer.wizard.result_views import box_in_view, place_at, point_at, snap
 from slviewer.wizard.snapshot import SessionView
 
 DEVIATION = "deviation"
@@ -150,6 +150,8 @@ UNKNOWN = "unknown"
 BALL, RECTANGLE, BOX = "ball", "rectangle", "box"
 BOX_COLOUR = (20, 150, 140)
 _PICKED = ("picked 1", "picked 2")
+_ENDS = ("end 1", "end 2")
+"""Marks of the chosen result's points."""
 PICK = ("Point", "Distance", "Section")
 FIT = ("Plane", "Sphere", "Cylinder")
 COMPARE = ("Relation", "Deviation")
@@ -245,6 +247,7 @@ class MeasurePanel(StepPanel):
     _sized_for = ""
     _on: MeasuredSurface | None = None
     _drawn: object = None
+    _drawn_ends: object = None
 
     def build(self) -> None:
         """Create the inputs of surface, tools and results."""
@@ -313,6 +316,7 @@ class MeasurePanel(StepPanel):
         self._fit.disabled = busy
         self._draw_tool()
         self._draw_picked()
+        self._draw_ends()
 
     def show(self, visible: bool) -> None:
         """Show or hide the panel's layer; the tool is reset, and clicks are ignored until one is
@@ -357,13 +361,26 @@ class MeasurePanel(StepPanel):
         if places:
             self._operator.measure(self._surface.name, self._tool.what, places)
 
+    def _move_pick(self, number: int, point: np.ndarray) -> None:
+        """Move a picked point to the point (3,) mm of the surface that it was dragged to."""
+        if self._on is not None and number < len(self._tool.picked):
+            self._tool.picked[number] = snap(self._on, point)
+            self.redraw()
+
+    def _move_end(self, name: str, number: int, point: np.ndarray) -> None:
+        """Request a measurement again with one of its points where it was dragged to."""
+        if self._on is not None:
+            self._operator.move_point(name, number, snap(self._on, point))
+
     def _draw_tool(self) -> None:
         """Show the instruction and the inputs of the tool."""
         tool = self._tool
         title = f"<b>{to_html(tool.name)}</b>: " if tool.name else ""
         clicks = tool.clicks and not (tool.fits and tool.by_rectangle)
         hover = self.layer.hover_html("surface") if clicks else ""
-        text = Html(title + to_html(tool.instruction) + hover)
+        marks = _PICKED[: len(tool.picked)] or _ENDS[: len(self._list_ends())]
+        drag = self.layer.drag_html("surface", marks)
+        text = Html(title + to_html(tool.instruction) + hover + drag)
         self._instruction.write(text, "info" if tool.name else "dim")
         self._end.visible = bool(tool.name)
         self._by.visible = tool.fits
@@ -388,9 +405,11 @@ class MeasurePanel(StepPanel):
         self._inside.set("")
         if on is None:
             return
+        for number, (name, place) in enumerate(zip(_PICKED, tool.picked, strict=False)):
+            title = "" if tool.fits else name[-1]
+            move = partial(self._move_pick, number)
+            self.layer.mark(name, point_at(on, place), title, on_drag=move)
         if region is None:
-            for name, place in zip(_PICKED, () if tool.fits else tool.picked, strict=False):
-                self.layer.mark(name, point_at(on, place), name[-1])
             return
         if region.kind == "ball":
             self.layer.ball(BALL, region.centre, float(region.size[0]))
@@ -401,6 +420,28 @@ class MeasurePanel(StepPanel):
             key,
             lambda: note(f"{len(on.within(region)):,} points in the {region.kind}"),
         )
+
+    def _list_ends(self) -> list[Place]:
+        """Return the places of the chosen result that can be dragged: on the surface that is
+        shown, while no other point is picked."""
+        chosen, on = self._results.chosen, self._on
+        if chosen is None or on is None or chosen.stale or self._tool.picked:
+            return []
+        return chosen.record.places() if chosen.record.source == on.source else []
+
+    def _draw_ends(self) -> None:
+        """Draw the points of the chosen result."""
+        chosen, places = self._results.chosen, self._list_ends()
+        key = (chosen and chosen.name, self._on and self._on.source, places)
+        if key == self._drawn_ends:
+            return
+        self._drawn_ends = key
+        self.layer.remove(*_ENDS)
+        if chosen is None or self._on is None:
+            return
+        for number, (name, place) in enumerate(zip(_ENDS, places, strict=False)):
+            move = partial(self._move_end, chosen.name, number)
+            self.layer.mark(name, point_at(self._on, place), "", on_drag=move)
 
     def _make_region(self) -> Region | None:
         """Return the ball around the picked point, or the box that was drawn; None unless the tool

@@ -286,7 +286,8 @@ class PosesPanel(StepPanel):
         if pose.T_camera_board is not None:
             about = "" if pose.state == "used" else "about "
             lines.append(coloured(f"Distance {about}{pose.T_camera_board[2, 3]:.0f} mm", "dim"))
-        picture = thumbnail(pose.thumbnail, 150, pose.name)
+        frame = self.context.offer_frame(pose.name)
+        picture = thumbnail(pose.thumbnail, 150, pose.name, frame)
         text = "".join(f"<div>{line}</div>" for line in lines)
         self._detail.set(
             paragraph(Html(f'<div style="display:flex;gap:0.8em">{picture}<div>{text}</div></div>'))

@@ -271,7 +271,8 @@ class ScanPanel(StepPanel):
         suffix = "" if shown == 1 else f", {shown} scans"
         self._support.label = f"Remove support{suffix}"
         self._support.disabled = busy or is_absent or shape_of(scan) != "scan"
-        self._gallery.set(gallery(sort_scans(self.session.scans), scan.name))
+        frame = self.context.offer_frame(scan.name)
+        self._gallery.set(gallery(sort_scans(self.session.scans), scan.name, frame))
         if self._is_live:
             return
         self._request_extrapolated(scan)
@@ -494,17 +495,20 @@ def sort_scans(scans: Sequence[ScanView]) -> list[ScanView]:
     return sorted(reversed(scans), key=lambda scan: shape_of(scan) != "scan")
 
 
-def gallery(scans: Sequence[ScanView], chosen: str) -> Html:
-    """Return thumbnails of the scans with their names; the chosen one is framed."""
+def gallery(scans: Sequence[ScanView], chosen: str, frame: str) -> Html:
+    """Return thumbnails of the scans with their names; the chosen one has a border, and a ``frame``
+    as `thumbnail`."""
     cards = []
     for scan in scans:
-        frame = "var(--mantine-primary-color-filled)" if scan.name == chosen else "transparent"
+        is_chosen = scan.name == chosen
+        border = "var(--mantine-primary-color-filled)" if is_chosen else "transparent"
+        picture = thumbnail(scan.thumbnail, 84, scan.label, frame if is_chosen else "")
         state = _STATES[scan.cloud] or f"{scan.figures.points:,} points"
         tone: Tone = "dim" if scan.cloud == "fresh" else "warning"
         cards.append(
             '<div style="width:92px;border:2px solid'
-            f" {frame};border-radius:6px;padding:2px;font-size:0.8rem;"
-            f'line-height:1.25;overflow-wrap:anywhere">{thumbnail(scan.thumbnail, 84, scan.label)}'
+            f" {border};border-radius:6px;padding:2px;font-size:0.8rem;"
+            f'line-height:1.25;overflow-wrap:anywhere">{picture}'
             f"<div>{to_html(scan.label)}</div>{coloured(state, tone)}</div>"
         )
     style = "display:flex;flex-wrap:wrap;gap:4px;max-height:260px;overflow-y:auto"
