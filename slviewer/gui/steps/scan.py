@@ -17,6 +17,7 @@ from slviewer.gui.colouring import (
     format_patches,
     paint_points,
     scan_values,
+    shade,
     uncertainty,
 )
 from slviewer.gui.live import LiveScreen
@@ -351,12 +352,8 @@ class ScanPanel(StepPanel):
             return
         self._forget_cloud()
         painted = np.array(SEEN_COLOURS)[(aligned.seen_by > 1).astype(int)]
-        # shows the relief
-        painted = (painted * (0.35 + 0.65 * np.clip(aligned.facing, 0, 1))[:, None]).astype(
-            np.uint8
-        )
         self._legend.set(aligned_html(aligned))
-        self.show_cloud(ALIGNED, aligned.points, painted)
+        self.show_cloud(ALIGNED, aligned.points, shade(painted, aligned.normals))
 
     def _redraw(self) -> None:
         """Draw the cloud again, as other points of it are hidden."""
