@@ -252,9 +252,15 @@ class SceneLayer:
             node.wxyz, node.position = _split_pose(T)
 
     def cloud(
-        self, name: str, points: np.ndarray, colours: np.ndarray | Colour, limit: int = SHOWN_POINTS
+        self,
+        name: str,
+        points: np.ndarray,
+        colours: np.ndarray | Colour,
+        limit: int = SHOWN_POINTS,
+        title: str = "",
     ) -> int:
-        """Draw a cloud (h, w, 3) or (n, 3) float32 mm; returns the number of points shown.
+        """Draw a cloud (h, w, 3) or (n, 3) float32 mm, listed by its title; returns the number of
+        points shown.
 
         Colours are grey levels of its shape, (..., 3) uint8, or one colour. NaN points are skipped.
         It is evenly thinned to about `limit` points, an organised cloud by rows and columns, so
@@ -264,14 +270,14 @@ class SceneLayer:
         if len(shown):
             node = add_points(self._api, self._make_path(name), shown, colours)
             node.point_size *= self._scene.point_scale
-            self._add(name, node)
+            self._add(name, node, title)
         else:
             self.remove(name)
         return len(shown)
 
-    def mesh(self, name: str, mesh: trimesh.Trimesh) -> None:
+    def mesh(self, name: str, mesh: trimesh.Trimesh, title: str = "") -> None:
         """Draw a mesh, mm, with its colours or texture."""
-        self._add(name, self._api.add_mesh_trimesh(self._make_path(name), mesh))
+        self._add(name, self._api.add_mesh_trimesh(self._make_path(name), mesh), title)
 
     def mark(
         self,

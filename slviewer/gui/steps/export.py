@@ -296,8 +296,10 @@ class ExportPanel(StepPanel):
         """Draw a loaded mesh, or a cloud."""
         if isinstance(made, trimesh.Trimesh):
             self.layer.remove("cloud")
-            self.layer.mesh("mesh", made)
-            self.show_points(self._source.value, np.asarray(made.vertices))
+            source = self._source.value
+            title = f"mesh of {scan_labels(self.session).get(source, source)}"
+            self.layer.mesh("mesh", made, title)
+            self.show_points(f"mesh {source}", np.asarray(made.vertices))
             return
         self.layer.remove("mesh")
         self.show_cloud(self._source.value, *made)

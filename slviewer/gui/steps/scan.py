@@ -21,7 +21,7 @@ from slviewer.gui.colouring import (
     uncertainty,
 )
 from slviewer.gui.live import LiveScreen
-from slviewer.gui.panel import RestoreButton, StepPanel, display_name, scan_options
+from slviewer.gui.panel import RestoreButton, StepPanel, display_name, scan_labels, scan_options
 from slviewer.gui.point_editing import PointEditing, RegionInputs
 from slviewer.gui.scene import Click
 from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
@@ -50,7 +50,7 @@ from slviewer.wizard.result_views import (
 )
 from slviewer.wizard.snapshot import BoardSeen, LiveView, PreviewView, ScanView, SessionView
 
-ONE, ALIGNED = "one", "aligned"
+ONE, ALIGNED = "one", "scans in place"
 EXTRAPOLATED = (140, 90, 200)
 LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capture"
 _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibration"}
@@ -161,7 +161,7 @@ class ScanPanel(StepPanel):
         ready = rig.is_idle and not self.is_blocked
         self._capture_folder.visible = self._capture.visible = rig.state != "none"
         self._capture.disabled = not ready
-        self._picture.is_large = not self.is_done
+        self._picture.is_large = self.is_ready
         self._draw_live(snapshot.live, ready)
         self._patterns.handle.disabled = not rig.is_idle
         if snapshot.session:
@@ -368,7 +368,8 @@ class ScanPanel(StepPanel):
         is_new = self._made is None or whole is not self._made[0]
         self._made = made
         (points,) = self._editing.set_scans([(cloud, cloud.points)])
-        shown = self.layer.cloud("cloud", points, painted)
+        title = scan_labels(self.session).get(cloud.name, cloud.name)
+        shown = self.layer.cloud("cloud", points, painted, title=title)
         removed = int(whole.measured_count - cloud.measured_count)
         kept = f", {removed:,} removed by edits and region" if removed else "; the file has all"
         text = Html(to_html(f"{shown:,} points shown{kept}. Click a point for its values."))

@@ -96,7 +96,7 @@ class VerifyPanel(StepPanel):
         """Show the verifications, and the chosen one."""
         session, rig, ready = self.session, self.snapshot.rig, not self.is_blocked
         self._capture_folder.visible = rig.state != "none"
-        self._picture.is_large = not self.is_done
+        self._picture.is_large = self.is_ready
         for button in self._captures:
             button.disabled = not (ready and rig.is_idle)
         rows = session.list_records(Verification)
@@ -118,7 +118,7 @@ class VerifyPanel(StepPanel):
         for shape, button in self._all.items():
             self._waiting[shape] = [scan.name for scan in waiting if shape_of(scan) == shape]
             n = len(self._waiting[shape])
-            button.visible, button.label = n > 0, f"Measure all {n} {shape}s"
+            button.visible, button.label = n > 1, f"Measure all {n} {shape}s"
         results = {row.name: row for row in rows}
         titles = {display_name(row.name, row.label): row.name for row in rows}
         self._result.offer(titles, follow=True)  # to what was just measured
