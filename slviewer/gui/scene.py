@@ -365,8 +365,6 @@ class ViewerScene:
             infinite_grid=True,
             cell_size=50.0,
             section_size=250.0,
-            cell_color=(225, 229, 233),
-            section_color=(190, 196, 202),
             fade_distance=2500.0,
             shadow_opacity=0.0,
         )

@@ -311,7 +311,8 @@ class Plot:
         if figure:
             self._image.image = figure.pixels
         self._image.visible = figure is not None
-        self._caption.set(note(figure.caption) if figure else "")
+        # in the dark theme, `page_style.css` exchanges light and dark
+        self._caption.set(f"<div data-figure>{note(figure.caption)}</div>" if figure else "")
 
 
 class Sound:
