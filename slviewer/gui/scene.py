@@ -194,6 +194,7 @@ class SceneLayer:
         as `Board.outline` gives them; the picture's rows run along the board's. Returns the handle
         of the picture, for clicks on it, None without one.
         """
+        self.remove(name)  # with its label and picture
         sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
         self.lines(name, sides, colour, width_px, T=T_camera_board)
         path = self._make_path(name)
@@ -541,5 +542,8 @@ def _relative_size(camera: viser.CameraHandle) -> float:
 def _set_view(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
     """Set one browser's camera position and target (3,) mm."""
     with client.atomic():
+        # viser sends no view that it takes for the browser's own, which a slow browser has already
+        # been sent away from: one beside it is always sent
+        client.camera.position = tuple(position + 1.0)
         client.camera.position = tuple(position)  # this also moves the target
         client.camera.look_at = tuple(at)
