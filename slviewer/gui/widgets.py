@@ -131,12 +131,15 @@ def table(
     """Return a table: by default the first column left-aligned, the others right-aligned. Lines
     break between words alone, where the panel is too narrow."""
 
+    is_wide = len(titles) > _ROOMY_COLUMNS
+    gap = 0.35 if is_wide else 0.6
+
     def line(tag: str, cells: Sequence[object], style: str) -> str:
         """Return one row of cells with this HTML tag and style."""
         sides = aligned or ["left", *["right"] * (len(cells) - 1)]
         return "".join(
             f'<{tag} style="text-align:{side};padding:0.2em 0 0.2em'
-            f' {0.6 * (k > 0):g}em;{style}">{to_html(c)}</{tag}>'
+            f' {gap * (k > 0):g}em;{style}">{to_html(c)}</{tag}>'
             for k, (side, c) in enumerate(zip(sides, cells, strict=True))
         )
 
@@ -146,7 +149,7 @@ def table(
     )
     body = "".join(f"<tr>{line('td', row, rule)}</tr>" for row in rows)
     style = "width:100%;border-collapse:collapse"
-    if len(titles) > _ROOMY_COLUMNS:
+    if is_wide:
         style += ";font-size:0.9em"
     return paragraph(
         Html(f'<div style="overflow-x:auto"><table style="{style}">'
@@ -155,7 +158,7 @@ def table(
 
 
 _ROOMY_COLUMNS = 5
-"""Of a table, in letters as large as the text's; more are drawn smaller."""
+"""Of a table, in letters as large as the text's; more are drawn smaller and closer."""
 
 
 def properties_table(title: object, properties: Mapping[str, object]) -> Html:

@@ -147,7 +147,7 @@
       line.style.width = `${mm / mmPerPx}px`;
       const turned = ["x", "y", "z"].map((name, i) => {
         const axis = toThree([0, 0, 0].with(i, 1)).transformDirection(camera.matrixWorldInverse);
-        return [name, ["#e03131", "#2f9e44", "#1971c2"][i], 24 * axis.x, -24 * axis.y, axis.z];
+        return [name, ["#e03131", "#2f9e44", "#228be6"][i], 24 * axis.x, -24 * axis.y, axis.z];
       });
       axes.innerHTML = `<svg width="64" height="64" viewBox="-32 -32 64 64" role="img" aria-label="Axes">${turned
         .sort((a, b) => a[4] - b[4])
