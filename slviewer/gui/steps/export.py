@@ -45,6 +45,8 @@ SHOWN_MESHES = ("stl", "ply", "obj", "glb")
 """Formats of meshes that are read back, to be shown."""
 MOST_MESH_BYTES = 80_000_000
 """Of a file that is shown: a larger one is slow to send and to draw."""
+_GREY = (130, 130, 130)
+"""Of meshes without colours."""
 MESHES = ("mesh", "merged-mesh")
 FORMAT_NAMES = {"xyz": "XYZ text", "yml": "OpenCV YAML", "xml": "OpenCV XML", "npz": "NumPy"}
 NUMBERS: dict[What, str] = {
@@ -281,7 +283,10 @@ class ExportPanel(StepPanel):
             """Load the mesh, or points (..., 3) mm and colours."""
             store = self.context.session
             if file and file.bytes < MOST_MESH_BYTES:
-                return read_mesh_file(file.path)
+                mesh = read_mesh_file(file.path)
+                if mesh.visual.kind is None:  # white, which the lights outshine
+                    mesh.visual.vertex_colors = _GREY
+                return mesh
             if name == MERGED:
                 values = merge_values(result_views.merged_cloud(store, merge), ())
             else:
@@ -297,7 +302,7 @@ class ExportPanel(StepPanel):
         if isinstance(made, trimesh.Trimesh):
             self.layer.remove("cloud")
             source = self._source.value
-            title = f"mesh of {scan_labels(self.session).get(source, source)}"
+            title = f"mesh of {scan_labels(self.session).get(source, 'merged scans')}"
             self.layer.mesh("mesh", made, title)
             self.show_points(f"mesh {source}", np.asarray(made.vertices))
             return
