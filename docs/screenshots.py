@@ -141,7 +141,7 @@ def main() -> None:
             page.goto(link)
             page.get_by_role("button", name="Autopilot").wait_for(timeout=60_000)
             page.get_by_text("frames/s").wait_for(timeout=60_000)
-            time.sleep(3)
+            time.sleep(12)  # until a line about the renderer is gone, and the preparation begins
             page.get_by_text("Preparing,").first.wait_for(state="hidden", timeout=1000 * LONGEST_S)
             page.mouse.move(640, 400)  # no hint is shown
             page.screenshot(path=Path(folder) / "start.png")
@@ -159,6 +159,11 @@ def main() -> None:
                     ),
                 )
                 draw_steps(page, everything, "after")
+            # the Autopilot leaves the step before its last result is drawn
+            page.get_by_role("button", name="8. Measure").click()
+            time.sleep(8)
+            shots.append(("Measure", Path(folder) / "measured.png"))
+            page.screenshot(path=shots[-1][1])
             browser.close()
         finally:
             server.terminate()
@@ -177,7 +182,8 @@ def main() -> None:
                 .convert("RGB")
                 .resize((960, 600), Image.Resampling.LANCZOS)
             )
-            image.quantize(96, dither=Image.Dither.NONE).save(
+            # which keeps the hues of thin lines beside many greys
+            image.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
                 ROOT / "docs" / "images" / f"{name}.png", optimize=True
             )
 
