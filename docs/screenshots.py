@@ -3,8 +3,8 @@ rig.
 
     python docs/screenshots.py [--all FOLDER]
 
-`--all` writes pictures of all steps into FOLDER instead, before, during and after the run, in
-several sizes, light and dark: to be looked at after changes of the page.
+`--all` also writes pictures of all steps into FOLDER, before, during and after the run, in several
+sizes, light and dark: to be looked at after changes of the page.
 
 Needs Chromium and the packages of the extra `test`; it takes some minutes. Writes
 `assets/readme/wizard.webp`, which is animated, and `docs/images/wizard_*.png`.
@@ -30,7 +30,7 @@ from chromium import launched  # noqa: E402
 
 SIZE = {"width": 1280, "height": 800}
 SHOWN_WIDTH = 800
-EVERY_S, LONGEST_S = 0.7, 600.0
+EVERY_S, LONGEST_S = 0.7, 1200.0
 FRAME_MS = 900
 TITLE = re.compile("[1-9]\\u2002([A-Z][a-z]+)")  # its number, an en space, its name
 MOST_A_STEP = 2
@@ -55,6 +55,7 @@ def draw_looks(page: Page, folder: Path, name: str) -> None:
             time.sleep(1)
             page.screenshot(path=folder / f"{name}_{width}x{height}_{scheme}.png")
     page.set_viewport_size(SIZE)  # type: ignore[arg-type]
+    page.emulate_media(color_scheme="light")
 
 
 def draw_steps(page: Page, folder: Path, name: str) -> None:
@@ -139,17 +140,18 @@ def main() -> None:
             page = browser.new_page(viewport=SIZE)  # type: ignore[arg-type]
             page.goto(link)
             page.get_by_role("button", name="Autopilot").wait_for(timeout=60_000)
-            time.sleep(3)
-            page.get_by_text("Software WebGL rendering detected").locator(
-                "xpath=ancestor::*[.//button][1]//button"
-            ).first.click()
+            page.get_by_text("frames/s").wait_for(timeout=60_000)
+            time.sleep(12)  # until a line about the renderer is gone, and the preparation begins
             page.get_by_text("Preparing,").first.wait_for(state="hidden", timeout=1000 * LONGEST_S)
+            page.mouse.move(640, 400)  # no hint is shown
             page.screenshot(path=Path(folder) / "start.png")
-            if everything:
+            if everything is None:
+                shots = draw_autopilot(page, Path(folder))
+            else:
                 everything.mkdir(parents=True, exist_ok=True)
                 draw_steps(page, everything, "before")
                 page.get_by_role("button", name="1. Rig").click()
-                draw_autopilot(
+                shots = draw_autopilot(
                     page,
                     Path(folder),
                     lambda step: draw_looks(
@@ -157,8 +159,11 @@ def main() -> None:
                     ),
                 )
                 draw_steps(page, everything, "after")
-                return
-            shots = draw_autopilot(page, Path(folder))
+            # the Autopilot leaves the step before its last result is drawn
+            page.get_by_role("button", name="8. Measure").click()
+            time.sleep(8)
+            shots.append(("Measure", Path(folder) / "measured.png"))
+            page.screenshot(path=shots[-1][1])
             browser.close()
         finally:
             server.terminate()
@@ -177,7 +182,8 @@ def main() -> None:
                 .convert("RGB")
                 .resize((960, 600), Image.Resampling.LANCZOS)
             )
-            image.quantize(96, dither=Image.Dither.NONE).save(
+            # which keeps the hues of thin lines beside many greys
+            image.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
                 ROOT / "docs" / "images" / f"{name}.png", optimize=True
             )
 

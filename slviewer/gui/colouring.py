@@ -89,9 +89,8 @@ def paint_points(shown: PointValues, colour: str) -> tuple[np.ndarray, Html]:
         pass
     elif values is None:
         legend = note(how.missing, "warning")
-    elif how.kind == "image":  # which has its own light and shadow
-        image = values if values.ndim == shown.points.ndim else values[..., None]
-        return np.broadcast_to(image, shown.points.shape), legend
+    elif how.kind == "image":
+        painted = values
     elif how.kind == "category":
         titles, palette = shown.categories[colour]
         painted = np.array(palette, np.uint8)[values.astype(np.int64) % len(palette)]
@@ -108,17 +107,19 @@ def paint_points(shown: PointValues, colour: str) -> tuple[np.ndarray, Html]:
 
 
 def shade(painted: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
-    """Return colours (..., 3) uint8, darker where the unit normals (..., 3) are turned away from
-    the light."""
+    """Return colours (..., 3) of colours or grey levels (...) uint8, darker where the unit normals
+    (..., 3) are turned away from the light."""
     if normals is None:
         return painted
+    if painted.ndim < normals.ndim:
+        painted = np.repeat(painted[..., None], 3, axis=-1)
     facing = 0.5 + 0.5 * (normals @ _LIGHT.astype(np.float32))
     share = np.where(np.isfinite(facing), _SHADOW + (1 - _SHADOW) * facing**2, 0.5)
     return np.asarray(painted * share[..., None].astype(np.float32)).astype(np.uint8)
 
 
 def in_view(legend: str) -> Html:
-    """Return a legend that the page shows in the 3D view, in its upper right corner."""
+    """Return a legend that the page shows in the 3D view, in its lower right corner."""
     return Html(f"<div data-legend>{legend}</div>" if legend else "")
 
 

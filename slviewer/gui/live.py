@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import viser
 
+from slviewer.gui.colouring import shade
 from slviewer.gui.panel import PanelContext, start_worker
 from slviewer.gui.scene import add_points, spacing, thin
+from slviewer.reconstruction.reconstruct import normals
 from slviewer.server.viewers import Viewers
 from slviewer.wizard.live_scan import LiveCloud
 
@@ -60,7 +62,10 @@ class LiveScreen:
         if not clients:
             return
         self._adapt_limit()
-        points, colours = thin(cloud.points, cloud.texture, self._limit)
+        measured = np.count_nonzero(np.isfinite(cloud.points[..., 2]))
+        step = int(max(np.sqrt(measured / self._limit), 1))  # normals of all points take too long
+        points, texture = cloud.points[::step, ::step], cloud.texture[::step, ::step]
+        points, colours = thin(points, shade(texture, normals(points, 1)), self._limit)
         self.points = len(points)
         if not len(points):
             self._remove_cloud()

@@ -453,7 +453,13 @@ def measurement_html(measured: Stored[Measurement], labels: Mapping[str, str]) -
     record = measured.record
     about = f"{record.what} on {labels.get(record.source, record.source)}, by {record.model}"
     about += f"; {record.where}." if record.where else "."
-    html = records_html([measured], labels, named=False) + note(about)
+    if record.deviation is None:
+        listed = list_quantities({measured.label: record})
+        own = [each for each in listed.columns if each.title not in ("measurement", "scan")]
+        html = report_table(replace(listed, caption="").select(own))
+    else:
+        html = records_html([measured], labels, named=False)
+    html += note(about)
     if record.deviation and (verdict := record.deviation.verdict) is not None:
         html = (
             alert(Html(f"<b>{to_html(verdict.text())}</b>"), DECISION_TONES[verdict.decision])

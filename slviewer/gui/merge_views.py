@@ -21,6 +21,7 @@ from slviewer.gui.colouring import (
     merge_values,
     paint_points,
     patch,
+    shade,
 )
 from slviewer.gui.panel import PanelPart, StepPanel
 from slviewer.gui.scene import TO_THE_RIGHT, Click
@@ -442,5 +443,5 @@ def _load_side_by_side(session: Session, key: _Key) -> _SideBySide:
     wide = max(float(np.ptp(np.percentile(points @ TO_THE_RIGHT, [1, 99]))) for points in flat)
     scan, onto = (np.median(points, axis=0) for points in flat)
     shift = onto - scan - (1 + _APART) * wide * TO_THE_RIGHT
-    painted = {side: cloud.texture for side, cloud in loaded.items()}
+    painted = {side: shade(cloud.texture, cloud_normals(cloud)) for side, cloud in loaded.items()}
     return _SideBySide(key, clouds, painted, shift, wide)

@@ -510,9 +510,9 @@ class StepPanel(ControlGroup):
         return self.snapshot.step(self.key).state == "blocked"
 
     @property
-    def is_done(self) -> bool:
-        """Whether the step has its result."""
-        return self.snapshot.step(self.key).state == "done"
+    def is_ready(self) -> bool:
+        """Whether the step can be done, and has no result yet."""
+        return self.snapshot.step(self.key).state == "ready"
 
     def show_points(self, name: str, points: np.ndarray | None) -> None:
         """Move the browsers' views to what is shown now, points (..., 3) mm, or once the panel is
@@ -523,7 +523,8 @@ class StepPanel(ControlGroup):
     def show_cloud(self, name: str, points: np.ndarray, colours: np.ndarray | Colour) -> int:
         """Draw a cloud (..., 3) mm in place of the last one, and move the browsers' views to it;
         returns the number of points drawn."""
-        drawn = self.layer.cloud("cloud", points, colours)
+        title = scan_labels(self.session).get(name, name)
+        drawn = self.layer.cloud("cloud", points, colours, title=title)
         self.show_points(name, points)
         return drawn
 

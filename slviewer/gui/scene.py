@@ -199,6 +199,7 @@ class SceneLayer:
         as `Board.outline` gives them; the picture's rows run along the board's. Returns the handle
         of the picture, for clicks on it, None without one.
         """
+        self.remove(name)  # with its label and picture
         sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
         self.lines(name, sides, colour, width_px, T=T_camera_board)
         path = self._make_path(name)
@@ -257,9 +258,15 @@ class SceneLayer:
             node.wxyz, node.position = _split_pose(T)
 
     def cloud(
-        self, name: str, points: np.ndarray, colours: np.ndarray | Colour, limit: int = SHOWN_POINTS
+        self,
+        name: str,
+        points: np.ndarray,
+        colours: np.ndarray | Colour,
+        limit: int = SHOWN_POINTS,
+        title: str = "",
     ) -> int:
-        """Draw a cloud (h, w, 3) or (n, 3) float32 mm; returns the number of points shown.
+        """Draw a cloud (h, w, 3) or (n, 3) float32 mm, listed by its title; returns the number of
+        points shown.
 
         Colours are grey levels of its shape, (..., 3) uint8, or one colour. NaN points are skipped.
         It is evenly thinned to about `limit` points, an organised cloud by rows and columns, so
@@ -269,14 +276,14 @@ class SceneLayer:
         if len(shown):
             node = add_points(self._api, self._make_path(name), shown, colours)
             node.point_size *= self._scene.point_scale
-            self._add(name, node)
+            self._add(name, node, title)
         else:
             self.remove(name)
         return len(shown)
 
-    def mesh(self, name: str, mesh: trimesh.Trimesh) -> None:
+    def mesh(self, name: str, mesh: trimesh.Trimesh, title: str = "") -> None:
         """Draw a mesh, mm, with its colours or texture."""
-        self._add(name, self._api.add_mesh_trimesh(self._make_path(name), mesh))
+        self._add(name, self._api.add_mesh_trimesh(self._make_path(name), mesh), title)
 
     def mark(
         self,
@@ -382,8 +389,6 @@ class ViewerScene:
             infinite_grid=True,
             cell_size=50.0,
             section_size=250.0,
-            cell_color=(225, 229, 233),
-            section_color=(190, 196, 202),
             fade_distance=2500.0,
             shadow_opacity=0.0,
         )
@@ -560,5 +565,8 @@ def _relative_size(camera: viser.CameraHandle) -> float:
 def _set_view(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
     """Set one browser's camera position and target (3,) mm."""
     with client.atomic():
+        # viser sends no view that it takes for the browser's own, which a slow browser has already
+        # been sent away from: one beside it is always sent
+        client.camera.position = tuple(position + 1.0)
         client.camera.position = tuple(position)  # this also moves the target
         client.camera.look_at = tuple(at)

@@ -279,18 +279,22 @@ class Shell(ControlGroup):
 
     def _draw_progress(self, snapshot: Snapshot) -> None:
         """Show the progress of capture and job, and whether it can be cancelled."""
-        work = _running_work(snapshot)
-        bars = "".join(
-            f'<div style="margin-bottom:0.3em">{to_html(text)}{meter(share)}</div>'
-            for text, share in work
-        )
-        progress = paragraph(Html(bars))
+        work, preparing = _running_work(snapshot), ""
+        progress = "".join(_progress_html(*each) for each in work)
         self._progress.set(progress)
         job = snapshot.job
         can_cancel = snapshot.rig.capture is not None or bool(job and job.can_cancel)
         self._cancel.visible = bool(work) and can_cancel
         # repeated on the left: it must not scroll out of view, nor move what is about to be clicked
-        self._busy.set(progress or note(f"{job.stage or job.name} …" if job else "Idle"))
+        if snapshot.preparing is not None:
+            text = (
+                f"Preparing, {100 * snapshot.preparing:.0f} %: compiling for this computer, once;"
+            )
+            preparing = _progress_html(
+                f"{text} the first pose and calibration wait for it", snapshot.preparing
+            )
+        idle = note(f"{job.stage or job.name} …" if job else "Idle")
+        self._busy.set(progress + preparing or idle)
 
     def _draw_session(self, snapshot: Snapshot) -> None:
         """Show the session's folder, contents and free space, the autopilot and the latest
@@ -419,10 +423,12 @@ def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
         waiting = f", {job.waiting} waiting" if job.waiting else ""
         stage = job.stage or "starting"
         work.append((f"{job.name}: {stage}{waiting} ({job.seconds:.0f} s)", job.share))
-    if snapshot.preparing is not None:
-        text = f"Preparing, {100 * snapshot.preparing:.0f} %: compiling for this computer, once;"
-        work.append((f"{text} the first pose and calibration wait for it", snapshot.preparing))
     return work
+
+
+def _progress_html(text: str, share: float) -> Html:
+    """Return a line about running work, with a bar that is filled to the share done."""
+    return paragraph(Html(f"{to_html(text)}{meter(share)}"))
 
 
 def show_links(context: PanelContext, client: viser.ClientHandle | None) -> None:

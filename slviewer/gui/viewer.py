@@ -20,6 +20,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from slviewer.errors import InputError
+from slviewer.gui.colouring import shade
 from slviewer.gui.scene import FIELD_OF_VIEW, add_points, frame_points, thin
 from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
 from slviewer.pipeline.operation import Job
@@ -43,8 +44,6 @@ FRAME_SCRIPT = (
 )
 """Browsers deny their storage to a frame of another site's page, such as a notebook's, and viser's
 page ends without one."""
-AMBIENT = 0.35
-"""Share of the brightness of a point whose surface is seen edge-on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +182,7 @@ def _find_shape(what: Any, name: str) -> _Shape:
 
 
 def _draw(scene: viser.SceneApi, shape: _Shape) -> None:
-    """Draw a mesh, or points in their colours, darker where the surface turns from the light, which
-    comes from the camera."""
+    """Draw a mesh, or points in their colours, shaded as in the wizard."""
     points, faces = shape.points, shape.faces
     if faces is not None and len(faces):
         if shape.colours is None:
@@ -195,16 +193,8 @@ def _draw(scene: viser.SceneApi, shape: _Shape) -> None:
         return
     if shape.colours is None:
         shape = replace(shape, colours=np.full(points.shape[:-1], 215, np.uint8))
-    colours = np.asarray(shape.colours, np.float32)
-    if colours.ndim == points.ndim - 1:
-        colours = np.repeat(colours[..., None], 3, axis=-1)
-    if shape.normals is not None:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
-            facing = np.abs(np.sum(rays * shape.normals, axis=-1, keepdims=True))
-        colours = colours * (AMBIENT + (1 - AMBIENT) * np.nan_to_num(facing, nan=1.0))
-    shown, colours = thin(points, colours.astype(np.uint8), SHOWN_POINTS)
-    add_points(scene, "/cloud", shown, colours)
+    colours = shade(np.asarray(shape.colours), shape.normals)
+    add_points(scene, "/cloud", *thin(points, colours, SHOWN_POINTS))
 
 
 def _in_notebook() -> bool:

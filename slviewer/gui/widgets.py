@@ -128,19 +128,19 @@ def alert(content: object, tone: Tone) -> Html:
 def table(
     titles: Sequence[object], rows: Sequence[Sequence[object]], aligned: Sequence[str] = ()
 ) -> Html:
-    """Return a table: by default the first column left-aligned, the others right-aligned and
-    without line breaks."""
+    """Return a table: by default the first column left-aligned, the others right-aligned. Lines
+    break between words alone, where the panel is too narrow."""
+
+    is_wide = len(titles) > _ROOMY_COLUMNS
+    gap = 0.35 if is_wide else 0.6
 
     def line(tag: str, cells: Sequence[object], style: str) -> str:
         """Return one row of cells with this HTML tag and style."""
         sides = aligned or ["left", *["right"] * (len(cells) - 1)]
-        sides = [
-            f"{side}{';white-space:nowrap' * (tag == 'td' and side == 'right')}" for side in sides
-        ]
         return "".join(
             f'<{tag} style="text-align:{side};padding:0.2em 0 0.2em'
-            f' 0.6em;{style}">{to_html(c)}</{tag}>'
-            for side, c in zip(sides, cells, strict=True)
+            f' {gap * (k > 0):g}em;{style}">{to_html(c)}</{tag}>'
+            for k, (side, c) in enumerate(zip(sides, cells, strict=True))
         )
 
     head = line("th", titles, f"color:{TONES['dim']};font-weight:600;vertical-align:bottom")
@@ -148,10 +148,17 @@ def table(
         "border-top:1px solid var(--mantine-color-default-border);font-variant-numeric:tabular-nums"
     )
     body = "".join(f"<tr>{line('td', row, rule)}</tr>" for row in rows)
+    style = "width:100%;border-collapse:collapse"
+    if is_wide:
+        style += ";font-size:0.9em"
     return paragraph(
-        Html(f'<div style="overflow-x:auto"><table style="width:100%;border-collapse:collapse">'
+        Html(f'<div style="overflow-x:auto"><table style="{style}">'
              f"<tr>{head}</tr>{body}</table></div>")
     )  # fmt: skip
+
+
+_ROOMY_COLUMNS = 5
+"""Of a table, in letters as large as the text's; more are drawn smaller and closer."""
 
 
 def properties_table(title: object, properties: Mapping[str, object]) -> Html:
@@ -312,7 +319,8 @@ class Plot:
         if figure:
             self._image.image = figure.pixels
         self._image.visible = figure is not None
-        self._caption.set(note(figure.caption) if figure else "")
+        # in the dark theme, `page_style.css` exchanges light and dark
+        self._caption.set(f"<div data-figure>{note(figure.caption)}</div>" if figure else "")
 
 
 class Sound:

@@ -437,14 +437,13 @@ def _initial_alignments(
 @dataclass(frozen=True, eq=False)
 class AlignedScans:
     """What the aligned scans show together: points (n, 3) float32 mm in the frame of the first one,
-    and how many of the scans see each of them, (n,) uint8. ``facing`` (n,) float32: cosine of the
-    angle between the surface's normal and the view of its scan. ``names``: the scans, in the order
-    in which they were captured."""
+    how many of the scans see each of them, (n,) uint8, and their unit normals (n, 3) float32, NaN
+    where unknown. ``names``: the scans, in the order in which they were captured."""
 
     names: tuple[str, ...]
     points: NDArray[np.float32]
     seen_by: NDArray[np.uint8]
-    facing: NDArray[np.float32]
+    normals: NDArray[np.float32]
 
     @property
     def share_seen_again(self) -> float:
@@ -563,14 +562,13 @@ def view_places(
     placed: Mapping[str, Placement], clouds: dict[str, Cloud], store: Session
 ) -> AlignedScans:
     """Scans in their places, thinned; ``clouds``: those that were loaded before."""
-    trees, facing = [], [np.zeros(0)]
+    trees, normals = [], [np.zeros((0, 3))]
     for name, each in placed.items():
         cloud = _load_cloud(store, name, clouds, ignore_warnings)
         step = max(1, np.count_nonzero(cloud.mask) // _SHOWN_POINTS)
-        points = cloud.measured[::step]
-        directions = choose_pixels(cloud_normals(cloud), cloud.mask)[::step]
-        trees.append(cKDTree(move_points(np.array(each.T_first_scan), points)))
-        facing.append(-np.sum(points * directions, axis=1) / np.linalg.norm(points, axis=1))
+        T = np.array(each.T_first_scan)
+        trees.append(cKDTree(move_points(T, cloud.measured[::step])))
+        normals.append(choose_pixels(cloud_normals(cloud), cloud.mask)[::step] @ T[:3, :3].T)
     spacing = [np.median(tree.query(tree.data[::20], k=2)[0][:, 1]) for tree in trees]
     reach = _REACH * max(spacing, default=0.0)
     counts = [np.zeros(0)]
@@ -585,7 +583,7 @@ def view_places(
         tuple(placed),
         np.concatenate([np.zeros((0, 3)), *(tree.data for tree in trees)]).astype(np.float32),
         np.concatenate(counts).astype(np.uint8),
-        np.nan_to_num(np.concatenate(facing)).astype(np.float32),
+        np.concatenate(normals).astype(np.float32),
     )
 
 

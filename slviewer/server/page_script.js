@@ -2,9 +2,11 @@
 // dozens of them waiting; drawn one after the other, React takes them for an endless loop, throws (its error 185), and
 // the rest of that batch is lost. So batches that wait together are handed over as one.
 //
-// The theme follows the system: viser's server knows one for all browsers. Its buttons show no hints: they are kept for
-// `control_script.js`.
+// The theme and the floor's colours follow the system: viser's server knows one for all browsers. Its buttons show no
+// hints: they are kept for `control_script.js`.
 const buttonHints = new Map();
+// Colours of the lines of the floor, in the light and in the dark theme.
+const FLOOR = { false: [[225, 229, 233], [190, 196, 202]], true: [[42, 45, 48], [62, 66, 70]] };
 (() => {
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const onmessage = Object.getOwnPropertyDescriptor(Worker.prototype, "onmessage");
@@ -13,6 +15,19 @@ const buttonHints = new Map();
     set(handler) {
       const waiting = [];
       const turn = new MessageChannel();
+      const themed = new Map();
+      const adapt = (message) => {
+        if (!message.props) message.dark_mode = dark.matches;
+        else [message.props.cell_color, message.props.section_color] = FLOOR[dark.matches];
+        return message;
+      };
+      dark.onchange = () => {
+        const messages = [...themed.values()].map(({ ...message }) => {
+          if (message.props) message.props = { ...message.props };
+          return adapt(message);
+        });
+        handler.call(this, { data: { type: "message_batch", messages } });
+      };
       turn.port1.onmessage = () => {
         const arrived = waiting.splice(0);
         for (let i = 0; i < arrived.length; ) {
@@ -21,12 +36,9 @@ const buttonHints = new Map();
             while (arrived[i]?.type === "message_batch") data.messages = data.messages.concat(arrived[i++].messages);
           for (const message of data?.messages ?? []) {
             if (message.props?.hint) buttonHints.set(message.uuid, message.props.hint);
-            if (message.type === "ThemeConfigurationMessage") {
-              message.dark_mode = dark.matches;
-              dark.onchange = () => {
-                const messages = [{ ...message, dark_mode: dark.matches }];
-                handler.call(this, { data: { type: "message_batch", messages } });
-              };
+            if (message.type === "ThemeConfigurationMessage" || message.type === "GridMessage") {
+              themed.set(message.type, message);
+              adapt(message);
             }
           }
           try {

@@ -21,7 +21,7 @@
     #view-bar button { font: inherit; color: inherit; padding: 7px 8px; border: 0; cursor: pointer; background: var(--mantine-color-body, #fff); }
     #view-bar button:hover { background: var(--mantine-color-default-hover, #eee); }
     #view-bar button[aria-pressed=true] { background: var(--mantine-primary-color-light, #d0ebff); }
-    [data-legend] { position: fixed; z-index: 5; right: var(--bar-right); top: var(--bar-top); width: 260px; padding: 6px 10px 2px;
+    [data-legend] { position: fixed; z-index: 5; right: var(--bar-right); bottom: calc(var(--bar-bottom) + 38px); width: 260px; padding: 6px 0 2px;
       border-radius: 5px; border: 1px solid var(--mantine-color-default-border, #ccc); background: var(--mantine-color-body, #fff); }
     #view-scale { pointer-events: none; }
     #view-scale hr { margin: 3px 0 0; height: 5px; border: solid currentcolor; border-width: 0 2px 2px; }
@@ -137,8 +137,8 @@
       drawn = key;
       const { style } = document.documentElement;
       style.setProperty("--bar-right", `${innerWidth - box.right + 10}px`);
-      style.setProperty("--bar-top", `${box.top + 10}px`);
-      Object.assign(bar.style, { right: "var(--bar-right)", bottom: `${innerHeight - box.bottom + 10}px` });
+      style.setProperty("--bar-bottom", `${innerHeight - box.bottom + 10}px`);
+      Object.assign(bar.style, { right: "var(--bar-right)", bottom: "var(--bar-bottom)" });
       Object.assign(scale.style, { left: `${box.left + 14}px`, bottom: `${innerHeight - box.bottom + 14}px` });
       const mmPerPx = (2 * distance * Math.tan((camera.fov * Math.PI) / 360)) / box.height;
       const decade = 10 ** Math.floor(Math.log10(SCALE_PX * mmPerPx));
@@ -147,7 +147,7 @@
       line.style.width = `${mm / mmPerPx}px`;
       const turned = ["x", "y", "z"].map((name, i) => {
         const axis = toThree([0, 0, 0].with(i, 1)).transformDirection(camera.matrixWorldInverse);
-        return [name, ["#e03131", "#2f9e44", "#1971c2"][i], 24 * axis.x, -24 * axis.y, axis.z];
+        return [name, ["#e03131", "#2f9e44", "#228be6"][i], 24 * axis.x, -24 * axis.y, axis.z];
       });
       axes.innerHTML = `<svg width="64" height="64" viewBox="-32 -32 64 64" role="img" aria-label="Axes">${turned
         .sort((a, b) => a[4] - b[4])

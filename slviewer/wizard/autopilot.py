@@ -22,8 +22,8 @@ RIG = {"driver": "simulated", "preset": "letter", "scale": 0.5, "seed": 0}
 TARGET = "circles:21x16:9"
 PLANE, SPHERE = "plane_04", "sphere_3"
 """Of the preset's plan, inside the calibrated depths."""
-PATIENCE_S = 120.0
-"""Time limit of one act."""
+PATIENCE_S = 300.0
+"""Time limit of one act: the first ones may wait until everything is compiled."""
 
 
 class Autopilot(Service):

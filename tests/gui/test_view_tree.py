@@ -48,3 +48,19 @@ def test_hidden_objects_stay_hidden_and_points_keep_their_size(server: SafeServe
     layer.remove("m1")
     layer.show(False)
     assert layer.list_objects() == other.list_objects() == {} and len(changes) == 2
+
+
+def test_objects_have_titles_and_boards_lose_their_labels(server: SafeServer) -> None:
+    scene = ViewerScene(server.viser, lambda do: do())
+    layer, outline = scene.layer("poses"), np.eye(4, 3)
+    layer.cloud("cloud", np.eye(3, dtype=np.float32), (1, 2, 3), title="A flat plate")
+    layer.mesh("mesh", trimesh.creation.box((10, 20, 30)), "mesh of merged scans")
+    layer.board("pose_01", np.eye(4), outline, (1, 2, 3), 1.0, label="pose_01")
+    assert [title for title, _ in layer.list_objects().values()] == [
+        "A flat plate",
+        "mesh of merged scans",
+        "pose_01",
+    ]
+    assert server.viser.scene.get_handle_by_name("/poses/pose_01/label") is not None
+    layer.board("pose_01", np.eye(4), outline, (1, 2, 3), 1.0)
+    assert server.viser.scene.get_handle_by_name("/poses/pose_01/label") is None

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.fringe.sequence import Axis
+from slviewer.gui.colouring import DEPTH, paint_points, scan_values
 from slviewer.gui.panel import StepPanel, scan_options
 from slviewer.gui.scene import Click
 from slviewer.gui.widgets import (
@@ -20,7 +21,6 @@ from slviewer.gui.widgets import (
     coloured,
     help_link,
     note,
-    paint,
     paragraph,
     properties_table,
     records_html,
@@ -331,13 +331,13 @@ class CalibratePanel(StepPanel):
             self.painter.request(
                 self._draw_cloud,
                 name,
-                lambda: result_views.load_scan_cloud(self.context.session, name),
+                lambda: paint_depths(result_views.load_scan_cloud(self.context.session, name)),
             )
 
-    def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
-        """Draw a cloud, coloured by depth, to choose pixels on."""
+    def _draw_cloud(self, made: tuple[result_views.ScanCloud, np.ndarray]) -> None:
+        """Draw a cloud in its colours, to choose pixels on."""
+        cloud, painted = made
         self._cloud = cloud
-        painted, _ = paint(cloud.points[..., 2], "mm", 1, "")
         self.show_cloud(cloud.name, cloud.points, painted)
 
     def _pick_pixel(self, click: Click) -> None:
@@ -347,6 +347,13 @@ class CalibratePanel(StepPanel):
             u, v = self._column.value, self._row.value = pixel
             self.layer.mark("picked", cloud.points[v, u], f"pixel ({u}, {v})")
             self.redraw()
+
+
+def paint_depths(
+    cloud: result_views.ScanCloud,
+) -> tuple[result_views.ScanCloud, np.ndarray]:
+    """Return a cloud, and its colours by depth."""
+    return cloud, paint_points(scan_values(cloud), DEPTH)[0]
 
 
 def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 
 from slviewer.errors import InputError, SlviewerError
+from slviewer.gui.colouring import TEXTURE, merge_values, paint_points, scan_values
 from slviewer.gui.panel import PanelPart, StepPanel, scan_labels, scan_options
 from slviewer.gui.widgets import (
     Html,
@@ -44,6 +45,8 @@ SHOWN_MESHES = ("stl", "ply", "obj", "glb")
 """Formats of meshes that are read back, to be shown."""
 MOST_MESH_BYTES = 80_000_000
 """Of a file that is shown: a larger one is slow to send and to draw."""
+_GREY = (130, 130, 130)
+"""Of meshes without colours."""
 MESHES = ("mesh", "merged-mesh")
 FORMAT_NAMES = {"xyz": "XYZ text", "yml": "OpenCV YAML", "xml": "OpenCV XML", "npz": "NumPy"}
 NUMBERS: dict[What, str] = {
@@ -61,8 +64,8 @@ METHODS: dict[str, Method] = {
 }
 SMALL, OPEN, SIZED, CLOSED = "fill small", "keep open", "fill up to size", "watertight"
 TEXTURES = {"none": None, "1024 px": 1024, "2048 px": 2048, "4096 px": 4096}
-TEXTURE = 2048
-"""Pixels of the textured mesh that one button writes."""
+TEXTURE_PX = 2048
+"""Of the textured mesh that one button writes."""
 SMOOTHING = {"none": 0, "light": 5, "strong": 20}
 """Number of iterations."""
 
@@ -123,7 +126,7 @@ class ExportPanel(StepPanel):
         with gui.add_folder("Cloud or mesh"):
             self._source = self.choice("Source")
             self._finish = self.button(
-                "Write textured mesh", partial(self._request_mesh, "glb", TEXTURE), "brush",
+                "Write textured mesh", partial(self._request_mesh, "glb", TEXTURE_PX), "brush",
                 hint="GLB with an image of the surface, 2048 px: for viewers and presentations",
             )  # fmt: skip
             self._stl = self.button(
@@ -276,31 +279,35 @@ class ExportPanel(StepPanel):
             file = _get_export(session, default_file_name(what, captured, chosen))
         written = file.path.stat().st_mtime_ns if file and file.path.exists() else 0
 
-        def load() -> trimesh.Trimesh | tuple[np.ndarray, np.ndarray | None]:
-            """Load the mesh, or points (..., 3) mm and colours; None: it has no colours."""
+        def load() -> trimesh.Trimesh | tuple[np.ndarray, np.ndarray]:
+            """Load the mesh, or points (..., 3) mm and colours."""
             store = self.context.session
             if file and file.bytes < MOST_MESH_BYTES:
-                return read_mesh_file(file.path)
+                mesh = read_mesh_file(file.path)
+                if mesh.visual.kind is None:  # white, which the lights outshine
+                    mesh.visual.vertex_colors = _GREY
+                return mesh
             if name == MERGED:
-                whole = result_views.merged_cloud(store, merge)
-                return whole.points, whole.colours
-            cloud = result_views.load_scan_cloud(store, name)
-            return cloud.points, cloud.texture
+                values = merge_values(result_views.merged_cloud(store, merge), ())
+            else:
+                values = scan_values(result_views.load_scan_cloud(store, name))
+            return values.points, paint_points(values, TEXTURE)[0]
 
         version = (*_points(session, name), session.restriction(name))
         key = (name, merge if name == MERGED else version, file, written)
         self.painter.request(self._draw_cloud, key, load)
 
-    def _draw_cloud(self, made: trimesh.Trimesh | tuple[np.ndarray, np.ndarray | None]) -> None:
-        """Draw a loaded mesh, or a cloud, grey where it has no colours."""
+    def _draw_cloud(self, made: trimesh.Trimesh | tuple[np.ndarray, np.ndarray]) -> None:
+        """Draw a loaded mesh, or a cloud."""
         if isinstance(made, trimesh.Trimesh):
             self.layer.remove("cloud")
-            self.layer.mesh("mesh", made)
-            self.show_points(self._source.value, np.asarray(made.vertices))
+            source = self._source.value
+            title = f"mesh of {scan_labels(self.session).get(source, 'merged scans')}"
+            self.layer.mesh("mesh", made, title)
+            self.show_points(f"mesh {source}", np.asarray(made.vertices))
             return
         self.layer.remove("mesh")
-        points, colours = made
-        self.show_cloud(self._source.value, points, (150, 150, 150) if colours is None else colours)
+        self.show_cloud(self._source.value, *made)
 
     # requests
 

@@ -7,7 +7,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from slviewer.gui.colouring import SURFACE_COLOURINGS, paint_points, surface_values
+from slviewer.gui.colouring import (
+    SURFACE_COLOURINGS,
+    in_view,
+    paint_points,
+    shade,
+    surface_values,
+)
 from slviewer.gui.measure_list import InspectionInputs, MeasurementList
 from slviewer.gui.panel import NO_SESSION, PanelPart, StepPanel, scan_options
 from slviewer.gui.scene import Click, Drag
@@ -143,7 +149,8 @@ def _colour_by_deviation(
     title = "deviation; red: outside, blue: inside, grey: not measured"
     scale = deviation_colours(np.linspace(-1, 1, 13), 1.0)
     legend = colour_bar(f"−{limit:.3g} mm", f"+{limit:.3g} mm", scale, title)
-    return points, np.concatenate([deviation_colours(arrays["signed"], limit), grey]), legend
+    painted = shade(deviation_colours(arrays["signed"], limit), arrays["normals"])
+    return points, np.concatenate([painted, grey]), in_view(legend)
 
 
 UNKNOWN = "unknown"

@@ -260,8 +260,10 @@ class MergePanel(StepPanel):
         self.layer.remove(*(f"cloud {name}" for name in before.keys() - clouds.clouds.keys()))
         scans = [(scan, clouds.clouds[scan.name][0]) for scan in clouds.scans]
         shown = self._editing.set_scans(scans) or [points for points, _ in clouds.clouds.values()]
+        labels = scan_labels(self.session)
         for points, (name, (_, painted)) in zip(shown, clouds.clouds.items(), strict=True):
-            self.layer.cloud(f"cloud {name}", points, painted, SHOWN)
+            title = labels.get(name, name)
+            self.layer.cloud(f"cloud {name}", points, painted, SHOWN, title)
         self._clouds = clouds
         self._show_layers()
 

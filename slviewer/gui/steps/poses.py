@@ -102,6 +102,10 @@ def _draw_field(count: int, width: int, height: int, mark: str = "") -> str:
     return f'<div style="{style};line-height:{height}px;text-align:center">{mark}</div>'
 
 
+_NEXT, _BOARD, _HANDLE = "next pose", "simulated board", "handle of the board"
+"""What is drawn beside the poses, as the list of the view names it."""
+
+
 class PosesPanel(StepPanel):
     """Panel of the step Poses."""
 
@@ -166,7 +170,7 @@ class PosesPanel(StepPanel):
                 "Retake": operator.retake_pose,
                 "Delete": operator.delete,
             }
-            self.button_group("Action", tuple(self._actions), self._request_action)
+            self._group = self.button_group("Action", tuple(self._actions), self._request_action)
             self._restore = RestoreButton(self)
         ImportInputs(self, "calibration")
         self._sound = Sound(gui)
@@ -181,7 +185,7 @@ class PosesPanel(StepPanel):
                 self._T_board_centre[:3, 3] = self._board.outline().mean(axis=0)
             self._world = None
         self._capture.disabled = snapshot.rig.state != "open" or self._board is None
-        self._picture.is_large = not self.is_done
+        self._picture.is_large = self.is_ready
         self._place.visible = snapshot.world is not None
         self._place.disabled = session.suggestion is None or session.pending_plan is not None
         self._hands_free.update(snapshot.hands_free)
@@ -199,6 +203,7 @@ class PosesPanel(StepPanel):
         self._draw_ghost(session)
         self._play_sound(poses, self.snapshot.hands_free)
         self._chosen.offer_names((pose.name for pose in reversed(poses)), follow=True)
+        self._chosen.handle.visible = self._group.visible = bool(poses)
         self._table.set(pose_table(poses))
         self._restore.offer(session.deleted_poses)
 
@@ -241,10 +246,10 @@ class PosesPanel(StepPanel):
         suggestion = None if session.enough else session.suggestion
         self._ghost_px = suggestion.outline_px if suggestion else None
         if suggestion is None or self._board is None:
-            self.layer.remove("suggestion")
+            self.layer.remove(_NEXT)
         else:
             T, outline = suggestion.T_camera_board, self._board.outline()
-            self.layer.board("suggestion", T, outline, GHOST, 4.0, label="next pose")
+            self.layer.board(_NEXT, T, outline, GHOST, 4.0, label=_NEXT)
 
     def _draw_world(self, snapshot: Snapshot) -> None:
         """Draw the simulated board and its handle, or which other object is in view."""
@@ -259,12 +264,12 @@ class PosesPanel(StepPanel):
             return
         T, centre = world.T_camera_object, self._T_board_centre
         if self._world is None:
-            layer.board("board", T, self._board.outline(), (70, 70, 70), 3.0)
-            layer.gizmo("handle", T @ centre, self._drag_board, self._place_board)
+            layer.board(_BOARD, T, self._board.outline(), (130, 130, 130), 3.0)
+            layer.gizmo(_HANDLE, T @ centre, self._drag_board, self._place_board)
         elif not np.array_equal(T, self._world):
-            layer.move("board", T)
+            layer.move(_BOARD, T)
             if time.monotonic() - self._dragged > _QUIET_S:
-                layer.move("handle", T @ centre)
+                layer.move(_HANDLE, T @ centre)
         self._world = T
 
     def _draw_choice(self) -> None:

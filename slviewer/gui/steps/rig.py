@@ -301,7 +301,7 @@ class RigPanel(StepPanel):
     def draw(self) -> None:
         """Show the rig."""
         rig = self.snapshot.rig
-        self._picture.is_large = not self.is_done
+        self._picture.is_large = self.is_ready
         self._draw_exposure(rig)
         self._exposure.disabled = self._light.handle.disabled = rig.state != "open"
         if rig.light in _NAMES:

@@ -17,10 +17,11 @@ from slviewer.gui.colouring import (
     format_patches,
     paint_points,
     scan_values,
+    shade,
     uncertainty,
 )
 from slviewer.gui.live import LiveScreen
-from slviewer.gui.panel import RestoreButton, StepPanel, display_name, scan_options
+from slviewer.gui.panel import RestoreButton, StepPanel, display_name, scan_labels, scan_options
 from slviewer.gui.point_editing import PointEditing, RegionInputs
 from slviewer.gui.scene import Click
 from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
@@ -49,7 +50,7 @@ from slviewer.wizard.result_views import (
 )
 from slviewer.wizard.snapshot import BoardSeen, LiveView, PreviewView, ScanView, SessionView
 
-ONE, ALIGNED = "one", "aligned"
+ONE, ALIGNED = "one", "scans in place"
 EXTRAPOLATED = (140, 90, 200)
 LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capture"
 _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibration"}
@@ -160,7 +161,7 @@ class ScanPanel(StepPanel):
         ready = rig.is_idle and not self.is_blocked
         self._capture_folder.visible = self._capture.visible = rig.state != "none"
         self._capture.disabled = not ready
-        self._picture.is_large = not self.is_done
+        self._picture.is_large = self.is_ready
         self._draw_live(snapshot.live, ready)
         self._patterns.handle.disabled = not rig.is_idle
         if snapshot.session:
@@ -352,12 +353,8 @@ class ScanPanel(StepPanel):
             return
         self._forget_cloud()
         painted = np.array(SEEN_COLOURS)[(aligned.seen_by > 1).astype(int)]
-        # shows the relief
-        painted = (painted * (0.35 + 0.65 * np.clip(aligned.facing, 0, 1))[:, None]).astype(
-            np.uint8
-        )
         self._legend.set(aligned_html(aligned))
-        self.show_cloud(ALIGNED, aligned.points, painted)
+        self.show_cloud(ALIGNED, aligned.points, shade(painted, aligned.normals))
 
     def _redraw(self) -> None:
         """Draw the cloud again, as other points of it are hidden."""
@@ -372,7 +369,8 @@ class ScanPanel(StepPanel):
         is_new = self._made is None or whole is not self._made[0]
         self._made = made
         (points,) = self._editing.set_scans([(cloud, cloud.points)])
-        shown = self.layer.cloud("cloud", points, painted)
+        title = scan_labels(self.session).get(cloud.name, cloud.name)
+        shown = self.layer.cloud("cloud", points, painted, title=title)
         removed = int(whole.measured_count - cloud.measured_count)
         kept = f", {removed:,} removed by edits and region" if removed else "; the file has all"
         text = Html(to_html(f"{shown:,} points shown{kept}. Click a point for its values."))

@@ -63,7 +63,7 @@ class TargetPanel(StepPanel):
     def draw(self) -> None:
         """Show the session's board, describe the entered one, and whether it is the session's."""
         session = self.session
-        self._picture.is_large = not self.is_done
+        self._picture.is_large = self.is_ready
         if session.folder != self._folder:
             self._folder = session.folder
             self._sheet.set("")

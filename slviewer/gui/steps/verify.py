@@ -3,16 +3,31 @@ capture."""
 
 from functools import partial
 
+import numpy as np
+
 from slviewer.gui.capture_inputs import SimulatedObject
+from slviewer.gui.colouring import in_view, shade
 from slviewer.gui.panel import StepPanel, display_name, scan_options
-from slviewer.gui.widgets import PLOT_PX, LiveImage, Plot, Text, colour_bar, colours, records_html
+from slviewer.gui.widgets import (
+    PLOT_PX,
+    Html,
+    LiveImage,
+    Plot,
+    Text,
+    colour_bar,
+    colours,
+    records_html,
+)
 from slviewer.pipeline.stored_records import Stored, load_arrays
+from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
 from slviewer.report.page import Figure
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import PreviewView, ScanView
 
+_Painted = tuple[result_views.ScanCloud, np.ndarray, Html]
+"""A cloud, its colours, and their legend."""
 _ICONS: dict[Shape, str] = {"plane": "square", "sphere": "sphere"}
 TABLE = "figures.csv"
 MUCH_MASKED = 0.2
@@ -81,7 +96,7 @@ class VerifyPanel(StepPanel):
         """Show the verifications, and the chosen one."""
         session, rig, ready = self.session, self.snapshot.rig, not self.is_blocked
         self._capture_folder.visible = rig.state != "none"
-        self._picture.is_large = not self.is_done
+        self._picture.is_large = self.is_ready
         for button in self._captures:
             button.disabled = not (ready and rig.is_idle)
         rows = session.list_records(Verification)
@@ -103,7 +118,7 @@ class VerifyPanel(StepPanel):
         for shape, button in self._all.items():
             self._waiting[shape] = [scan.name for scan in waiting if shape_of(scan) == shape]
             n = len(self._waiting[shape])
-            button.visible, button.label = n > 0, f"Measure all {n} {shape}s"
+            button.visible, button.label = n > 1, f"Measure all {n} {shape}s"
         results = {row.name: row for row in rows}
         titles = {display_name(row.name, row.label): row.name for row in rows}
         self._result.offer(titles, follow=True)  # to what was just measured
@@ -135,20 +150,23 @@ class VerifyPanel(StepPanel):
 
         self.painter.request(self._maps.set, key, draw_maps)
         model = self._model.value
-        self.painter.request(
-            self._draw_cloud,
-            (key, model),
-            lambda: (result_views.whole_cloud(context.session, name), model, record.shape),
-        )
 
-    def _draw_cloud(self, made: tuple[result_views.ScanCloud, str, Shape]) -> None:
-        """Draw a cloud coloured by the error of a model, with its legend."""
-        cloud, model, shape = made
-        limit = error_limit(list(cloud.errors.values()))
-        painted = colours(cloud.errors[model], -limit, limit, "error")
+        def paint_cloud() -> _Painted:
+            """Load the capture's cloud, and colour it by the error of the model."""
+            cloud = result_views.whole_cloud(context.session, name)
+            limit = error_limit(list(cloud.errors.values()))
+            painted = colours(cloud.errors[model], -limit, limit, "error")
+            title = f"error of {model}; {SIGN[record.shape]}; grey: not evaluated"
+            bar = colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title)
+            return cloud, shade(painted, cloud_normals(cloud)), in_view(bar)
+
+        self.painter.request(self._draw_cloud, (key, model), paint_cloud)
+
+    def _draw_cloud(self, made: _Painted) -> None:
+        """Draw a cloud in its colours, with their legend."""
+        cloud, painted, bar = made
         self.show_cloud(cloud.name, cloud.points, painted)
-        title = f"error of {model}; {SIGN[shape]}; grey: not evaluated"
-        self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
+        self._legend.set(bar)
 
     # requests
 
