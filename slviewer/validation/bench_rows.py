@@ -5,6 +5,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from timeit import repeat, timeit
@@ -12,10 +13,16 @@ from timeit import repeat, timeit
 import numpy as np
 from numba import prange
 
-from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
+from slviewer.calibration.splined.compiled import DEPTHS, GRID_CELLS_ACROSS, CompiledAxis
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.evaluation.render import Row
+from slviewer.fringe import kernels_coded, kernels_levels
+from slviewer.fringe.decode import code_rules, grey_scale, pack_levels, pack_shifts
+from slviewer.fringe.layout import axis_layout
+from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.threshold import fringe_mean
 from slviewer.geometry import cuda_device
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats, move_points, turn_about
@@ -125,7 +132,59 @@ def move_bytes(frames, numbers, grey, single, triple):
                 triple[k, y, x, 0] = triple[k, y, x, 1] = triple[k, y, x, 2] = broken[x]
 
 
+def allocate_floor(
+    frames: np.ndarray, numbers: int, written: tuple[int, int, int]
+) -> tuple[np.ndarray, ...]:
+    """Allocate the arrays of `move_bytes`: ``numbers`` read beside the frames; ``written`` in its
+    order."""
+    shape, (greys, singles, triples) = frames.shape[1:], written
+    return (
+        frames,
+        np.zeros((numbers, *shape), np.float32),
+        np.zeros((greys, *shape), frames.dtype),
+        np.zeros((singles, *shape), np.float32),
+        np.zeros((triples, *shape, 3), np.float32),
+    )
+
+
+def prepare_kernel(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
+    """Return the decoding of axis x into arrays made before, with the noise known, and without a
+    look at neighbours."""
+    layout = axis_layout(sequence, "x")
+    scale = grey_scale(layout, measure_noise(layout, frames, 255.0), 255.0)
+    maps = tuple(np.zeros(frames.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
+    shifts = pack_shifts(layout)
+    if not layout.gray:
+        ladder = pack_levels(layout)
+        return lambda: kernels_levels.decode_levels(frames, shifts, ladder, scale, maps)
+    rules = code_rules(layout, fringe_mean(layout, frames))
+    return lambda: kernels_coded.decode_coded(frames, shifts, scale, rules, maps)
+
+
+def make_calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledAxis, np.ndarray]:
+    """Coefficients of a plausible rig: their values do not change the time."""
+    height, width = shape
+    v, u = np.mgrid[:height, :width] / width
+    ones = np.ones(shape, np.float32)
+    c = np.stack([300 + 16 * u, 1.3 * ones, -2e-4 * ones, (u - 0.5) / 2, (v - 0.4) / 2])
+    fit = PixelFit(
+        c,
+        np.zeros((3, *shape), np.float32),
+        np.full(shape, 25, np.uint16),
+        30 * ones,
+        250 * ones,
+        ones,
+    )
+    near, far = 200.0, 1000.0
+    step = max(2, -(-width // GRID_CELLS_ACROSS))
+    grid = np.zeros(((height - 1) // step + 2, (width - 1) // step + 2, DEPTHS), np.float32)
+    centred = np.stack([500 + 16 * u, 0.45 * ones, -1e-4 * ones]).astype(np.float32)
+    compiled = CompiledAxis(centred, 455.5, grid, grid, step, near, far)
+    return PixelwiseModel({"x": fit}, {"x": PERIOD_PX}, {}, "x"), compiled, c[3:].astype(np.float32)
+
+
 TIMES = 15
+PERIOD_PX = 18.0
 AHEAD = 8
 """Copies that keep the device busy while what is measured is queued: it then waits for no
 Python."""
@@ -225,17 +284,40 @@ def fringes_row(frames: int, size: tuple[int, int], ours: float) -> Row:
     return row(f"decode {len(levels)} frames, fringes {version('fringes')}", seconds, note=note)
 
 
+@dataclass(frozen=True, eq=False)
+class ReliefPair:
+    """Two noisy clouds of one relief, 1.4 M points each, of which the second is moved by 4 degrees
+    and 5 mm; ``true_transform`` (4, 4) moves it back."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    moved: np.ndarray
+    moved_normals: np.ndarray
+    true_transform: np.ndarray
+
+    @classmethod
+    def make(cls) -> "ReliefPair":
+        """Return the pair with its noise of a fixed seed."""
+        (points, normals), (moved, moved_normals) = _make_relief(0, 0.0), _make_relief(1, 0.037)
+        turn = np.radians(4.0) * np.array([1.0, 0.5, 2.0]) / 2.29
+        truth = turn_about(turn, moved.mean(0), np.array([3.0, -3.0, 2.6]))
+        back = np.linalg.inv(truth).astype(np.float64)
+        return cls(
+            points, normals, move_points(truth, moved), moved_normals @ truth[:3, :3].T, back
+        )
+
+    def align(self) -> Floats:
+        """Align by the program's registration, with its checks of the result."""
+        scan = prepare_scan("scan", self.moved, self.moved_normals)
+        reference = prepare_scan("reference", self.points, self.normals)
+        size, initial = min(scan.size, reference.size), Candidate(np.eye(4), "initial")
+        return register_prepared(scan, reference, size, initial).T_reference_scan
+
+
 def registration_rows() -> list[Row]:
-    """Aligning two noisy clouds of one relief, 1.4 M points each, 4 degrees and 5 mm apart: ours,
-    then `small-gicp`."""
-    (points, normals), (moved, moved_normals) = _make_relief(0, 0.0), _make_relief(1, 0.037)
-    truth = turn_about(
-        np.radians(4.0) * np.array([1.0, 0.5, 2.0]) / 2.29,
-        moved.mean(0),
-        np.array([3.0, -3.0, 2.6]),
-    )
-    start = np.linalg.inv(truth).astype(np.float64)
-    moved, moved_normals = move_points(truth, moved), moved_normals @ truth[:3, :3].T
+    """Aligning the clouds of a `ReliefPair`: ours, then `small-gicp`."""
+    pair = ReliefPair.make()
+    points, moved, true_transform = pair.points, pair.moved, pair.true_transform
     count = f"{len(points) / 1e6:.2f} M points"
 
     def time_alignment(
@@ -243,17 +325,12 @@ def registration_rows() -> list[Row]:
     ) -> Row:
         """The row of an alignment (4, 4), with its largest error over the scan, in um."""
         few = moved[::997]
-        worst = np.linalg.norm(move_points(align(), few) - move_points(start, few), axis=1).max()
+        worst = np.linalg.norm(
+            move_points(align(), few) - move_points(true_transform, few), axis=1
+        ).max()
         return row(stage, median(align, 3), target=target, note=f"{1e3 * worst:.1f} um off, {note}")
 
-    def ours() -> np.ndarray:
-        """Align by the program's registration, with its checks of the result."""
-        scan = prepare_scan("scan", moved, moved_normals)
-        reference = prepare_scan("reference", points, normals)
-        size, initial = min(scan.size, reference.size), Candidate(np.eye(4), "initial")
-        return register_prepared(scan, reference, size, initial).T_reference_scan
-
-    rows = [time_alignment(f"align {count}", ours, "with checks of the result", 0.6)]
+    rows = [time_alignment(f"align {count}", pair.align, "with checks of the result", 0.6)]
     if missing("small-gicp"):
         return rows
     import small_gicp

@@ -191,7 +191,7 @@ def _time_whole_captures(scene: Any) -> list[Row]:
     for megapixels in WHOLE_MEGAPIXELS:
         scale = float(np.sqrt(megapixels / 1.92))
         with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
-            _save_scans(Path(folder, "session"), scale, scene, 1)
+            save_scans(Path(folder, "session"), scale, scene, 1)
             for _ in range(2):  # the first compiles
                 output = run_python("-c", _RECONSTRUCTED, str(Path(folder, "session")))
         lasted, peak = map(float, output.split()[-2:])
@@ -205,7 +205,7 @@ def _time_whole_captures(scene: Any) -> list[Row]:
     return rows
 
 
-def _save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
+def save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
     """Make a session with the rig's true calibration and so many equal scans."""
     rig = letter(scale)
     true_calibration(session, rig)
@@ -226,7 +226,7 @@ def _time_batches(scene: Any) -> list[Row]:
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
         session = Path(folder, "session")
-        _save_scans(session, 1.0, scene, BATCH)
+        save_scans(session, 1.0, scene, BATCH)
         for workers in WORKERS:
             with (
                 LocalCluster(

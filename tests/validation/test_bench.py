@@ -2,12 +2,14 @@
 business."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 from facts import missing_facts
 
-from slviewer.validation.bench import Benchmark
+from slviewer.validation import bench_check
+from slviewer.validation.bench import Benchmark, bench
 from slviewer.validation.bench_rows import megabytes, missing, move_bytes, row, time_beside
 
 
@@ -40,3 +42,24 @@ def test_the_table_and_its_json() -> None:
     assert stage["MB"] == 1.0 and abs(stage["ratio to floor"] - 1.5) < 1e-9
     assert abs(stage["ratio NumPy / kernel"] - 20) < 1e-9
     assert missing("numpy") == ""
+
+
+def test_check_names_stages_that_grew(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = {"steady": [1.9] * 9, "busy at first": [2.1] * 5 + [1.5] + [2.1] * 3}
+    times["grown"] = [2.1] * 9
+    stages = {name: (partial(next, iter(each)), lambda: 1.0) for name, each in times.items()}
+    monkeypatch.setattr(bench_check, "_prepare_stages", lambda scale, folder: stages)
+    monkeypatch.setattr(bench_check, "LIMITS", dict.fromkeys(times, 2.0))
+    checked = bench(check=True)
+    assert [each["holds"] for each in checked.rows] == ["yes", "yes", "no"]
+    assert missing_facts(checked.failure, "grown") == []
+    assert "steady" not in checked.failure and "busy" not in checked.failure
+
+
+@pytest.mark.slow
+@pytest.mark.computes
+@pytest.mark.process
+def test_no_stage_is_slower_than_its_limit() -> None:
+    checked = bench(check=True)
+    assert [each["stage"] for each in checked.rows] == list(bench_check.LIMITS)
+    assert not checked.failure, checked.text()
