@@ -11,7 +11,7 @@ from itertools import product
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from slviewer.calibration.board_pose import solve_pose
 from slviewer.errors import InputError
@@ -244,7 +244,9 @@ def _list_candidates(
     size = np.array(lens.size)
     pixels = (size - 1) / 2 + shares[:, None] * (places * size / 2)[:, None]
     depths = near + (far - near) * (np.arange(3) + 0.5) / 3
-    R = Rotation.from_rotvec([(angle * x, angle * y, 0.0) for x, y in _TILT_AXES]).as_matrix()
+    R = scipy.spatial.transform.Rotation.from_rotvec(
+        [(angle * x, angle * y, 0.0) for x, y in _TILT_AXES]
+    ).as_matrix()
     # by depth, tilt, place and share
     T = place_board(board, lens, R[:, None, None], depths[:, None, None, None], pixels)
     visible = _is_visible(board, lens, T.reshape(-1, 4, 4), illuminated).reshape(T.shape[:-2])

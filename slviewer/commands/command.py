@@ -219,30 +219,71 @@ def _find_module(source: str) -> tuple["_Module", str]:
     return _read_module(module if module in sys.modules else f"slviewer.{module}"), name
 
 
+_STATEMENT = re.compile(
+    r"^(?:(@)|(?:def|class) (\w+)|(from [\w.]+ import )|([A-Za-z_]\w*)(?=: | = ))", re.MULTILINE
+)
+"""Beginning of a statement of a module: a decorator, a definition, an import or a value."""
+
+
 class _Module(dict[str, Any]):
     """Types and constants of a module by name. Those of slviewer are evaluated from their source,
-    whose functions, classes, values and imports are the ``nodes``; the module is not imported."""
+    statement by statement where they are used; the module is not imported."""
 
     def __init__(self, name: str) -> None:
         super().__init__(TYPES)
         self.name = name
         spec = find_spec(name)
         assert spec is not None and spec.origin is not None
-        self.nodes: dict[str, ast.AST | None] = {}
-        for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+        self._source = Path(spec.origin).read_text(encoding="utf-8")
+        self._nodes: dict[str, ast.AST | None] = {}
+        self._statements: dict[str, str] = {}
+        try:
+            self._split_source()
+        except SyntaxError:  # a string of several lines looks like a statement
+            self._parse(self._source)
+
+    def _split_source(self) -> None:
+        """Parse the imports, and note the text of the other statements by the names they define."""
+        behind_docstring = self._source.find('"""', 3) + 3
+        begun = [*_STATEMENT.finditer(self._source, behind_docstring)]
+        ends = [match.start() for match in begun[1:]] + [len(self._source)]
+        start = None
+        for match, end in zip(begun, ends, strict=True):
+            decorator, defined, imported, value = match.groups()
+            start = match.start() if start is None else start
+            if decorator:
+                continue
+            text, start = self._source[start:end], None
+            if imported:
+                self._parse(text)
+            else:
+                self._statements[defined or value] = text
+
+    def _parse(self, text: str) -> None:
+        """Add the functions, classes, values and imports of some source to the nodes."""
+        for node in ast.parse(text).body:
             match node:
                 case ast.FunctionDef(defined) | ast.ClassDef(defined):
-                    self.nodes[defined] = node
+                    self._nodes[defined] = node
                 case ast.Assign([ast.Name(defined)], value):
-                    self.nodes[defined] = value
+                    self._nodes[defined] = value
                 case ast.AnnAssign(ast.Name(defined), _, default):
-                    self.nodes[defined] = default
+                    self._nodes[defined] = default
                 case ast.ImportFrom():
-                    self.nodes |= {alias.asname or alias.name: node for alias in node.names}
+                    self._nodes |= {alias.asname or alias.name: node for alias in node.names}
+
+    def find_node(self, name: str) -> ast.AST | None:
+        """Return the function, class, value or import of that name, None where there is none."""
+        if (text := self._statements.pop(name, None)) is not None:
+            try:
+                self._parse(text)
+            except SyntaxError:
+                self._parse(self._source)
+        return self._nodes.get(name)
 
     def __missing__(self, name: str) -> Any:
         """Evaluate a name from the module's source, or import it. Raises KeyError."""
-        match self.nodes.get(name):
+        match self.find_node(name):
             case ast.expr() as value:
                 return self.evaluate(value)
             case ast.ImportFrom(str(origin)) if origin.startswith("slviewer."):
@@ -262,7 +303,7 @@ _read_module = cache(_Module)
 def _read_function(module: _Module, name: str) -> tuple[str, Described]:
     """Return what the docstring of a function says before ``Args:`` and below it, and the
     function's parameters; where it has settings, the latter are those of the settings."""
-    definition = module.nodes[name]
+    definition = module.find_node(name)
     assert isinstance(definition, ast.FunctionDef)
     text, _, described = (ast.get_docstring(definition) or "").partition("\n\nArgs:\n")
     for decorator in definition.decorator_list:
@@ -288,7 +329,7 @@ def _read_function(module: _Module, name: str) -> tuple[str, Described]:
 def _read_settings(module: _Module, name: str) -> Described:
     """Return what a dataclass of settings and its bases describe of their fields, and these
     fields."""
-    match module.nodes[name]:
+    match module.find_node(name):
         case ast.ImportFrom(str(origin)):
             return _read_settings(_read_module(origin), name)
         case ast.ClassDef() as settings:

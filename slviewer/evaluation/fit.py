@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 import cv2
 import numpy as np
-from scipy.ndimage import label
+import scipy
 
 from slviewer.errors import InputError
 from slviewer.geometry.robust import robust_sigma
@@ -363,12 +363,12 @@ def _largest_patch(agreeing: Map) -> Map:
     """Return the largest 4-connected patch; gaps of up to four unmeasured pixels do not cut it, and
     small holes are filled."""
     closed = cv2.morphologyEx(agreeing.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    patches, count = label(closed)
+    patches, count = scipy.ndimage.label(closed)
     if not count:
         return np.zeros_like(agreeing)
     patch = patches == 1 + np.argmax(np.bincount(patches.ravel())[1:])
     # in a frame, which joins what reaches the image's border
-    others, _ = label(np.pad(~patch, 1, constant_values=True), np.ones((3, 3)))
+    others, _ = scipy.ndimage.label(np.pad(~patch, 1, constant_values=True), np.ones((3, 3)))
     is_hole = np.bincount(others.ravel()) < 0.005 * np.count_nonzero(patch)
     is_hole[[0, others[0, 0]]] = False  # the patch itself, and what surrounds it
     return np.asarray(patch | is_hole[others[1:-1, 1:-1]])

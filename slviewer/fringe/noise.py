@@ -3,7 +3,6 @@
 from functools import cache
 
 import numpy as np
-from scipy.optimize import nnls
 
 from slviewer.fringe.cosines import cosine_columns, fit_common_harmonics, fit_cosine
 from slviewer.fringe.layout import Layout
@@ -171,5 +170,16 @@ def _fit_line(levels: np.ndarray, variances: np.ndarray, counts: np.ndarray) -> 
     weight = np.sqrt(counts) / np.maximum(variances, 0.1 * variances.mean() + 1e-12)
     design = np.stack([np.ones_like(levels), levels], axis=1) * weight[:, None]
     target = variances * weight
-    a, b = nnls(design, target)[0]
-    return float(a), float(b)
+    products, sums = design.T @ design, design.T @ target
+    (aa, ab), (_, bb) = products
+    determinant = aa * bb - ab**2
+    a, b = bb * sums[0] - ab * sums[1], aa * sums[1] - ab * sums[0]
+    if determinant > 0 and a >= 0 and b >= 0:
+        return float(a / determinant), float(b / determinant)
+    # one of the two is 0: of which the other explains more
+    alone = np.maximum(sums, 0) / np.diag(products)
+    return (
+        (float(alone[0]), 0.0)
+        if alone[0] * sums[0] >= alone[1] * sums[1]
+        else (0.0, float(alone[1]))
+    )

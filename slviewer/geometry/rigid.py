@@ -3,9 +3,9 @@ frame b."""
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -45,13 +45,18 @@ def rigid_transform(R: Floats, t: Floats) -> Floats:
 def transform_from_rvec(rvec: ArrayLike, tvec: ArrayLike) -> Floats:
     """(4, 4): the motion of a rotation vector (rad) and a translation (mm) as OpenCV returns them,
     of any shape."""
-    return rigid_transform(Rotation.from_rotvec(np.ravel(rvec)).as_matrix(), np.ravel(tvec))
+    return rigid_transform(_rotation_matrix(rvec), np.ravel(tvec))
+
+
+def _rotation_matrix(rvec: ArrayLike) -> Floats:
+    """(3, 3): the rotation by a vector of three rad, of any shape."""
+    return np.asarray(cv2.Rodrigues(np.ravel(rvec).astype(np.float64))[0])
 
 
 def turn_about(rotation: Floats, centre: Floats, shift: Floats | float = 0.0) -> Floats:
     """(4, 4): the turn by a rotation vector (3,) rad about ``centre`` (3,) mm, then the shift (3,)
     mm."""
-    R = Rotation.from_rotvec(rotation).as_matrix()
+    R = _rotation_matrix(rotation)
     return rigid_transform(R, centre - R @ centre + shift)
 
 
@@ -90,7 +95,9 @@ def nearest_rotation(M: Floats) -> Floats:
 
 def rotation_angle(R: Floats) -> Floats:
     """(...,) rad: the angle of rotations (..., 3, 3), 0 to pi."""
-    return Rotation.from_matrix(R).magnitude()
+    across = [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]]
+    sine = np.sqrt(sum(each**2 for each in across))
+    return np.arctan2(sine, np.trace(R, axis1=-2, axis2=-1) - 1)
 
 
 def largest_angle_deg(directions: Floats) -> float:

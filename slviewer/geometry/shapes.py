@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial import cKDTree
+import scipy
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, Mask
@@ -99,7 +98,7 @@ def fit_sphere(points: np.ndarray, radius: float | None = None) -> Sphere:
         return derivatives
 
     unknowns = np.append(centre, start) if radius is None else centre
-    fit = least_squares(
+    fit = scipy.optimize.least_squares(
         distances, unknowns, jacobian, method="lm", ftol=1e-14, xtol=1e-12, max_nfev=200
     )
     r, rms = float(fit.x[3]) if radius is None else radius, np.sqrt(2 * fit.cost / len(points))
@@ -264,7 +263,7 @@ def _minimal_sets(sample: Floats, size: int, rng: np.random.Generator) -> Floats
     draws; four neighbours, often.
     """
     seeds = rng.choice(len(sample), HYPOTHESES)
-    tree = cKDTree(sample)
+    tree = scipy.spatial.cKDTree(sample)
     sets = np.empty((HYPOTHESES, size, 3))
     for share, group in zip(
         (0.01, 0.03, 0.1, 0.25), np.array_split(np.arange(HYPOTHESES), 4), strict=True

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.linalg import solveh_banded
+import scipy
 
 from slviewer.errors import InputError
 from slviewer.geometry.jit import kernel
@@ -105,7 +104,7 @@ def fit_spline(
     bases = cells_u, basis_u, cells_v, basis_v
     reached = len(np.unique(cells_v * nx + cells_u))
     columns, count = nx + 3, (nx + 3) * (ny + 3)
-    penalty = sp.tril(bending_energy(columns, ny + 3), format="coo")
+    penalty = scipy.sparse.tril(bending_energy(columns, ny + 3), format="coo")
     prior = np.zeros((3 * columns + 4, count))  # in lower banded form
     prior[penalty.row - penalty.col, penalty.col] = smooth * penalty.data
     prior[0] += RIDGE
@@ -117,7 +116,7 @@ def fit_spline(
         band = prior.copy()
         right = np.zeros(count)
         _accumulate(*bases, w, rest, columns, band, right)
-        solution = solveh_banded(
+        solution = scipy.linalg.solveh_banded(
             band, right, lower=True, overwrite_ab=True, overwrite_b=True, check_finite=False
         )
         coefficients = solution.reshape(-1, columns)
@@ -149,21 +148,21 @@ def cubic_basis(
     return cell, weights
 
 
-def second_differences(count: int) -> sp.dia_array:
+def second_differences(count: int) -> "scipy.sparse.dia_array":
     """Return the second differences (count - 2, count) of so many coefficients."""
-    return sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
+    return scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
 
 
-def bending_energy(columns: int, rows: int) -> sp.sparray:
+def bending_energy(columns: int, rows: int) -> "scipy.sparse.sparray":
     """Return the quadratic form d_uu^2 + 2 d_uv^2 + d_vv^2 of coefficients (rows, columns), as of a
     thin plate.
 
     It is a sparse matrix (rows columns, rows columns) of first and second differences.
     """
-    first = [sp.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
-    uu = sp.kron(sp.eye(rows), second_differences(columns))
-    vv = sp.kron(second_differences(rows), sp.eye(columns))
-    uv = sp.kron(first[1], first[0])
+    first = [scipy.sparse.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
+    uu = scipy.sparse.kron(scipy.sparse.eye(rows), second_differences(columns))
+    vv = scipy.sparse.kron(second_differences(rows), scipy.sparse.eye(columns))
+    uv = scipy.sparse.kron(first[1], first[0])
     return uu.T @ uu + 2.0 * uv.T @ uv + vv.T @ vv
 
 

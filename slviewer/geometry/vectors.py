@@ -1,8 +1,8 @@
 """Lengths, directions, means, distances and cubes of many vectors."""
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 
 def lengths(vectors: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ def subsample(values: np.ndarray, most: int) -> np.ndarray:
     return values[:: max(1, -(-len(values) // most))]
 
 
-def median_spacing(tree: cKDTree, samples: int) -> float:
+def median_spacing(tree: "scipy.spatial.cKDTree", samples: int) -> float:
     """Return the median distance of points of a search tree to their nearest other point, over some
     ``samples`` of them; infinite for a single point."""
     distance, _ = tree.query(tree.data[:: max(1, tree.n // samples)], k=2)

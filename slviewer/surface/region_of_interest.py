@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, Mask, rigid_transform
@@ -63,13 +63,15 @@ class RegionOfInterest:
     @classmethod
     def placed(cls, T_camera_box: np.ndarray, size_mm: Triple) -> "RegionOfInterest":
         """Return the box of a size at T (4, 4), from the box's frame to the camera's."""
-        angles = Rotation.from_matrix(T_camera_box[:3, :3]).as_euler("xyz", degrees=True)
+        angles = scipy.spatial.transform.Rotation.from_matrix(T_camera_box[:3, :3]).as_euler(
+            "xyz", degrees=True
+        )
         return cls(_triple(T_camera_box[:3, 3]), size_mm, _triple(angles))
 
     @property
     def T_camera_box(self) -> Floats:
         """(4, 4): from the frame of the box, in its middle along its sides, to the camera's."""
-        turn = Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
+        turn = scipy.spatial.transform.Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
         return rigid_transform(turn.as_matrix(), np.array(self.centre_mm))
 
     def contains(self, points: np.ndarray) -> Mask:

@@ -5,9 +5,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+import scipy
 
 from slviewer.errors import InputError
 from slviewer.geometry.vectors import lengths, unit_vectors
@@ -101,7 +99,7 @@ def transfer_attributes(known: Mesh | PointSet, vertices: np.ndarray, faces: np.
     points = known.vertices if isinstance(known, Mesh) else known.points
     attributes: dict[str, Any] = {}
     if len(mesh.vertices) and (known.colours is not None or known.sigma_mm is not None):
-        _, nearest = cKDTree(points).query(mesh.vertices)
+        _, nearest = scipy.spatial.cKDTree(points).query(mesh.vertices)
         attributes = pick_attributes(known, nearest)
     return replace(mesh, **(attributes | {"normals": vertex_normals(mesh)}))
 
@@ -201,8 +199,10 @@ def list_adjacent_faces(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def label_connected(pairs: np.ndarray, count: int) -> np.ndarray:
     """Return the connected part (count,) int of each of ``count`` nodes that ``pairs`` (k, 2) of
     them join."""
-    graph = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(pairs), bool), tuple(pairs.T)), shape=(count, count)
+    )
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
 
 
 def face_groups(faces: np.ndarray, n_vertices: int, chosen: np.ndarray | None = None) -> np.ndarray:

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from scipy.special import erf
+import scipy
 
 from slviewer.errors import BoardError, DetectionError
 from slviewer.geometry.rigid import Floats, Floats32, Mask
@@ -410,7 +410,7 @@ def _evaluate_model(q: Floats, offset: Floats) -> tuple[Floats, Floats]:
     angles = q[:, 2:4].T[..., None]
     normal_u, normal_v = np.cos(angles), np.sin(angles)
     distance = normal_u * x + normal_v * y
-    edge = erf(distance / (np.sqrt(2) * sigma))
+    edge = scipy.special.erf(distance / (np.sqrt(2) * sigma))
     slope = np.sqrt(2 / np.pi) / sigma * np.exp(-0.5 * (distance / sigma) ** 2)
     cross, ahead = edge[0] * edge[1], slope * edge[::-1]
     gain = light * kappa

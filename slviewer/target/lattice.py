@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from slviewer.errors import DetectionError
 from slviewer.geometry.polynomial import grid_points
@@ -72,7 +72,7 @@ def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
     one at most."""
     if len(blobs.centres) < 6:
         return
-    tree = cKDTree(blobs.centres)
+    tree = scipy.spatial.cKDTree(blobs.centres)
     free = np.ones(len(blobs.centres), bool)
     seeds = (seed for seed in _list_seeds(tree, blobs) if free[seed[0]])
     for seed in islice(seeds, SEEDS):
@@ -100,7 +100,9 @@ def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
         pitch = grid_map.pitch_px(nodes.astype(float))
         own_pitch = np.maximum(grid_map.pitch_px(lattice.nodes * 1.0), 1e-9)
         typical = np.median(np.sqrt(blobs.areas[lattice.blobs]) / own_pitch)
-        apart, nearest = cKDTree(blobs.centres).query(grid_map.to_image(nodes.astype(float)))
+        apart, nearest = scipy.spatial.cKDTree(blobs.centres).query(
+            grid_map.to_image(nodes.astype(float))
+        )
         ratio = np.sqrt(blobs.areas[nearest]) / np.maximum(typical * pitch, 1e-9)
         is_alike = np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(AREA_RATIO) / 2
         on = (pitch > 0) & (apart < NODE_RADIUS * pitch) & is_alike
@@ -144,7 +146,7 @@ def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
     return []
 
 
-def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, Floats, Floats]]:
+def _list_seeds(tree: "scipy.spatial.cKDTree", blobs: Blobs) -> list[tuple[int, Floats, Floats]]:
     """Return (blob, step, step) of blobs with similar neighbours opposite each other in two
     directions, best first."""
     centres, areas = blobs.centres, blobs.areas
@@ -176,7 +178,12 @@ def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, Floats, Floats]]
 
 
 def _grow(
-    tree: cKDTree, blobs: Blobs, free: Mask, seed: int, first: Floats, second: Floats
+    tree: "scipy.spatial.cKDTree",
+    blobs: Blobs,
+    free: Mask,
+    seed: int,
+    first: Floats,
+    second: Floats,
 ) -> Lattice:
     """Grow the lattice around a ``seed`` blob with steps ``first`` and ``second`` (2,) px along its
     two directions.

@@ -1,12 +1,18 @@
 """Starting is quick because nothing heavy is imported before a command works."""
 
+import ast
 import inspect
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from slviewer.cli import COMMANDS, main
+from slviewer.commands.command import _Module
+from slviewer.simulation.plans import letter_plan
+from slviewer.simulation.rig import letter
+from slviewer.validation.bench_scaling import save_scans
 
 CODE = """
 import sys
@@ -18,6 +24,17 @@ for arguments in (["--version"], ["--help"], ["import", "p18", "--help"], *helps
     heavy = {"numpy", "numba", "scipy", "cv2", "open3d", "viser", "matplotlib", "zarr"}
     heavy |= {"distributed", "fsspec"}
     assert not heavy & set(sys.modules), (arguments, heavy & set(sys.modules))
+"""
+
+RECONSTRUCT = """
+import sys
+from slviewer.cli import main
+
+assert main(["reconstruct", sys.argv[1], "scan_01"]) == 0
+unused = {"open3d", "matplotlib", "viser", "zarr", "trimesh", "distributed"}
+parts = ("ndimage", "optimize", "sparse", "spatial", "special", "stats")
+unused |= {f"scipy.{part}" for part in parts}  # numba itself imports scipy.linalg
+assert not unused & set(sys.modules), unused & set(sys.modules)
 """
 
 
@@ -50,3 +67,36 @@ def test_help_says_that_extrapolated_points_are_omitted(
 ) -> None:
     assert main([command, "--help"]) == 0
     assert "xtrapolated" in capsys.readouterr().out
+
+
+@pytest.mark.process
+@pytest.mark.computes
+def test_reconstruct_imports_no_more_than_it_uses(tmp_path: Path) -> None:
+    scale, session = 0.15, tmp_path / "session"
+    save_scans(session, scale, letter_plan(letter(scale), poses=3)["pose_01"], 1)
+    code = [sys.executable, "-c", RECONSTRUCT, str(session)]
+    run = subprocess.run(code, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+def test_modules_are_read_where_strings_look_like_statements(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = '''"""
+NAME = 3
+"""
+TEXT = """
+def other(:
+"""
+@cache
+def last(x: int = 1) -> int:
+    return x
+WIDTH: int = 4
+'''
+    (tmp_path / "made_up.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    module = _Module("made_up")
+    assert module["WIDTH"] == 4 and module["TEXT"] == "\ndef other(:\n"
+    assert module.find_node("NAME") is None
+    definition = module.find_node("last")
+    assert isinstance(definition, ast.FunctionDef) and len(definition.decorator_list) == 1

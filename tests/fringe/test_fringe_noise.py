@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 from fringe_scene import capture, slope, variants
+from scipy.optimize import nnls
 
 from slviewer.fringe.decode import decode
+from slviewer.fringe.noise import _fit_line
 from slviewer.fringe.presets import complementary, gray, p18
 
 pytestmark = pytest.mark.computes
@@ -58,3 +60,18 @@ def test_the_predicted_phase_noise_is_what_repeats_show():
     seen = np.std((first.phase - second.phase)[both]) / np.sqrt(2)
     predicted = np.sqrt(np.mean(first.sigma_phase[both] ** 2))
     assert seen == pytest.approx(predicted, rel=0.05)
+
+
+def test_the_line_of_the_variances_is_the_non_negative_fit():
+    rng = np.random.default_rng(0)
+    signs = set()
+    for a, b in ((2.0, 0.05), (2.0, 0.0), (0.0, 0.05), (2.0, -0.02), (-1.0, 0.05), (-1.0, -1.0)):
+        levels, counts = np.sort(rng.uniform(10, 250, 16)), rng.integers(5, 50, 16) * 1.0
+        variances = np.maximum(a + b * levels + rng.normal(0, 0.1, 16), 1e-3)
+        weight = np.sqrt(counts) / np.maximum(variances, 0.1 * variances.mean() + 1e-12)
+        design = np.stack([np.ones(16), levels], axis=1) * weight[:, None]
+        expected = nnls(design, variances * weight)[0]
+        assert _fit_line(levels, variances, counts) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        signs.add(tuple(expected > 0))
+    assert len(signs) == 3  # both, and each of them alone
+    assert _fit_line(np.full(2, 9.0), np.array([1.0, 1.0]), np.ones(2))[0] >= 0

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numba
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 from threadpoolctl import threadpool_limits
 
 from slviewer.calibration.observe import Observation
@@ -285,7 +285,7 @@ def pose_residuals(
     i, points = bundle.poses.index(observation.name), observation.points
     if observation.name in bundle.half_turned_poses:
         points = 2 * box_middle(bundle.points) - points
-    distances, feature = cKDTree(bundle.points[:, :2]).query(points[:, :2])
+    distances, feature = scipy.spatial.cKDTree(bundle.points[:, :2]).query(points[:, :2])
     known = distances < 1e-3
     data = PoseData(
         np.array([0, np.count_nonzero(known)]),

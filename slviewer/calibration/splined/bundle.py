@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.linalg import solve_triangular
+import scipy
 
 from slviewer.calibration.known_camera import CameraCheck
 from slviewer.calibration.splined.normal import (
@@ -92,7 +91,7 @@ class Bundle:
         illuminated."""
         return self.camera_poses > 0, self.projector_poses > 0
 
-    def point_jacobian(self, axis: Axis, pixels: Floats, z: Floats) -> sp.csr_matrix:
+    def point_jacobian(self, axis: Axis, pixels: Floats, z: Floats) -> "scipy.sparse.csr_matrix":
         """Return the Jacobian (3 n, unknowns) of measured points, mm per unit of the rig's
         unknowns.
 
@@ -102,15 +101,17 @@ class Bundle:
         """
         return compute_point_jacobian(self.state, axis, pixels, z)
 
-    def whiten(self, jacobian: sp.csr_matrix | np.ndarray) -> np.ndarray:
+    def whiten(self, jacobian: "scipy.sparse.csr_matrix | np.ndarray") -> np.ndarray:
         """Return Y (unknowns, m), where Y.T @ Y is the covariance of the values with ``jacobian``
         (m, unknowns)."""
         dense = jacobian if isinstance(jacobian, np.ndarray) else jacobian.toarray()
         right = np.asarray(dense, self.factor.dtype).T
-        return solve_triangular(self.factor, right, lower=True, check_finite=False)
+        return scipy.linalg.solve_triangular(self.factor, right, lower=True, check_finite=False)
 
 
-def compute_point_jacobian(state: State, axis: Axis, pixels: Floats, z: Floats) -> sp.csr_matrix:
+def compute_point_jacobian(
+    state: State, axis: Axis, pixels: Floats, z: Floats
+) -> "scipy.sparse.csr_matrix":
     """Compute the Jacobian (3 n, unknowns) described in ``Bundle.point_jacobian``."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     at, entries = state.layout, ROW - CAMERA
@@ -119,7 +120,9 @@ def compute_point_jacobian(state: State, axis: Axis, pixels: Floats, z: Floats) 
     _fill_rows(plane, "xy".index(axis), pixels, z, at.starts - at.rig, values, columns)
     indices = np.repeat(columns, 3, axis=0).ravel()
     pointers = np.arange(0, 3 * len(z) + 1) * entries
-    return sp.csr_matrix((values.ravel(), indices, pointers), (3 * len(z), at.size - at.rig))
+    return scipy.sparse.csr_matrix(
+        (values.ravel(), indices, pointers), (3 * len(z), at.size - at.rig)
+    )
 
 
 @kernel()

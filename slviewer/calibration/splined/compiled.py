@@ -10,7 +10,7 @@ them.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+import scipy
 
 from slviewer.calibration.splined.correction_grid import evaluate
 from slviewer.calibration.splined.unknowns import (
@@ -123,7 +123,7 @@ def compile_axis(
     known = np.isfinite(grid) & at_camera & lit.reshape(shape)
     # a pixel needs its eight nodes: dilating the known nodes by one gives each pixel about its own
     # support
-    unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
+    unknown = scipy.ndimage.binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
     supported_grid = np.where(unknown, np.float32(np.nan), grid)
     return CompiledAxis(coefficients, centre, grid, supported_grid, step, near, far)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from scipy.linalg import blas, cho_solve, lapack, solve_triangular
+import scipy
 
 from slviewer.calibration.splined.residuals import (
     CAMERA,
@@ -221,8 +221,10 @@ class BlockFactor:
             factor = factorize(A[block, block].copy())
             after = A[block, second].T if block.start < second.start else A[second, block]
             coupling = np.concatenate([A[first, block], after])
-            coupling = blas.dtrsm(1.0, factor, coupling.T, lower=1, overwrite_b=1)
-            rest = blas.dsyrk(-1.0, coupling, 1.0, rest.T, trans=1, lower=1, overwrite_c=1).T
+            coupling = scipy.linalg.blas.dtrsm(1.0, factor, coupling.T, lower=1, overwrite_b=1)
+            rest = scipy.linalg.blas.dsyrk(
+                -1.0, coupling, 1.0, rest.T, trans=1, lower=1, overwrite_c=1
+            ).T
             self._eliminated.append((block, factor, coupling))
         self._rest_factor = factorize(rest)
 
@@ -230,11 +232,15 @@ class BlockFactor:
         """Return the solution for a right-hand side (N,) or several (N, k)."""
         out = np.empty_like(right)
         for block, factor, _ in self._eliminated:
-            out[block] = solve_triangular(factor, right[block], lower=True, check_finite=False)
+            out[block] = scipy.linalg.solve_triangular(
+                factor, right[block], lower=True, check_finite=False
+            )
         rest = right[self._rest] - sum(c.T @ out[block] for block, _, c in self._eliminated)
-        out[self._rest] = rest = cho_solve((self._rest_factor, True), rest, check_finite=False)
+        out[self._rest] = rest = scipy.linalg.cho_solve(
+            (self._rest_factor, True), rest, check_finite=False
+        )
         for block, factor, coupling in self._eliminated:
-            out[block] = solve_triangular(
+            out[block] = scipy.linalg.solve_triangular(
                 factor, out[block] - coupling @ rest, lower=True, trans=1, check_finite=False
             )
         return out
@@ -246,7 +252,7 @@ def factorize(A: Floats) -> Floats:
 
     Raises CalibrationRejected where the matrix is not positive definite.
     """
-    factor, failed = lapack.dpotrf(A.T, lower=1, clean=0, overwrite_a=1)
+    factor, failed = scipy.linalg.lapack.dpotrf(A.T, lower=1, clean=0, overwrite_a=1)
     if failed:
         raise CalibrationRejected(
             "the poses leave the joint adjustment undetermined: capture the board in more positions"

@@ -12,8 +12,8 @@ prediction by a factor estimated from the fields' supported part: ``persistence_
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numba import prange
-from scipy.ndimage import binary_erosion, distance_transform_edt, minimum_filter, uniform_filter
 
 from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.unknowns import (
@@ -239,7 +239,9 @@ def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> Si
     unknown = np.isnan(sigma) | (abs(jacobian).sum(axis=1).A1 == 0)
     sigma, unknown = sigma.reshape(u.shape), unknown.reshape(u.shape)
     # a measured pixel may be next to a node outside the projector's view
-    nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(
+        unknown, return_distances=False, return_indices=True
+    )
     return SigmaMap(np.ascontiguousarray(sigma[tuple(nearest)], np.float32), near, far)
 
 
@@ -275,15 +277,21 @@ def persistence_ratio(device: Device, illuminated: Mask) -> float:
     The sums are over neighbouring cells that are all ``illuminated`` (rows, columns) bool.
     """
     c = device.coefficients
-    known = minimum_filter(np.pad(illuminated, ((0, 1), (0, 1)), mode="edge"), 2, mode="nearest")
-    whole = binary_erosion(known, np.ones((EXTRAPOLATED_CELLS, EXTRAPOLATED_CELLS), bool))
+    known = scipy.ndimage.minimum_filter(
+        np.pad(illuminated, ((0, 1), (0, 1)), mode="edge"), 2, mode="nearest"
+    )
+    whole = scipy.ndimage.binary_erosion(
+        known, np.ones((EXTRAPOLATED_CELLS, EXTRAPOLATED_CELLS), bool)
+    )
     if not whole.any():
         return 1.0
     across, down = np.diff(c[:, 1:-1], 2, axis=2), np.diff(c[:, :, 1:-1], 2, axis=1)
     each, together = 0.0, 0.0
     for differences in (*across, *down):
         each += float(np.mean(differences[known] ** 2))
-        together += float(np.mean(uniform_filter(differences, EXTRAPOLATED_CELLS)[whole] ** 2))
+        together += float(
+            np.mean(scipy.ndimage.uniform_filter(differences, EXTRAPOLATED_CELLS)[whole] ** 2)
+        )
     return max(1.0, EXTRAPOLATED_CELLS * float(np.sqrt(together / max(each, 1e-300))))
 
 

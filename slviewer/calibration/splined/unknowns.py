@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import scipy.sparse as sp
+import scipy
 from numpy.typing import NDArray
 
 from slviewer.geometry.brown import distort_to_px, fold_radius_squared, undistort_point
@@ -72,7 +72,7 @@ def roughness(coefficients: Floats) -> Floats:
     """(n, n): the prior's quadratic form of one component's n coefficients, second differences and
     a small ridge."""
     rows, columns = coefficients.shape[1:]
-    return (bending_energy(columns, rows) + RIDGE * sp.eye(rows * columns)).toarray()
+    return (bending_energy(columns, rows) + RIDGE * scipy.sparse.eye(rows * columns)).toarray()
 
 
 def undistort(device: Device, pixels: Floats) -> Floats:
