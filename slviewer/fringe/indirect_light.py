@@ -25,6 +25,8 @@ BIT_SHARE = 0.65
 is misread: that takes as much indirect light as direct. Adhesive tape on a board differs by up to a
 half, and is measured well."""
 UNSEEN = np.float32(1e9)
+CHUNK_PX = 512
+"""Pixels of a row that are compared at a time: what is computed of them fits a core's own cache."""
 BIT_SIGMAS = 8.0
 """... and in standard deviations of a grey level: noise alone does not make such a range."""
 EDGE_CELLS = 0.4
@@ -95,8 +97,6 @@ def _mask_unequal_bits(task: DecodingTask, maps: Maps) -> None:
     count, cell = len(layout.gray), layout.gray_cell_px
     spans = [cell * 2.0 ** (count - bit) for bit in range(count)]
     frames, inverses = list(layout.gray), list(layout.inverse) or [-1] * count
-    if layout.complementary is not None:
-        frames, inverses, spans = [*frames, layout.complementary], [*inverses, -1], [*spans, cell]
     guard = max(EDGE_CELLS * cell, EDGE_PX)
     wide = [k for k, span in enumerate(spans) if span > 4 * guard]
     if len(wide) < 2:
@@ -124,56 +124,73 @@ def _mask_unequal_bits(task: DecodingTask, maps: Maps) -> None:
 def _compare_bits(stack, first, frames, inverses, spans, limits, phase, background, reason):
     """Set the reason INDIRECT in rows from ``first`` on; the three maps contain only these rows."""
     to_px, origin, guard, noise_a, noise_b = limits
-    width = phase.shape[1]
-    place, heights = np.empty(width, np.float32), np.empty(width, np.float32)
+    edges, heights = np.empty(CHUNK_PX, np.int32), np.empty(CHUNK_PX, np.float32)
     ranges = (
-        np.empty(width, np.float32),
-        np.empty(width, np.float32),
-        np.empty(width, np.float32),
-        np.empty(width, np.float32),
+        np.empty(CHUNK_PX, np.float32),
+        np.empty(CHUNK_PX, np.float32),
+        np.empty(CHUNK_PX, np.float32),
+        np.empty(CHUNK_PX, np.float32),
     )
+    spacing = min(spans) / 2
+    bits = [np.int32(round(span / (2 * spacing))) for span in spans]
     for i in range(len(phase)):
-        ranges[0][:], ranges[1][:], ranges[2][:], ranges[3][:] = 0, UNSEEN, 0, UNSEEN
-        for x in range(width):
-            place[x] = phase[i, x] * np.float32(to_px) - np.float32(origin)
-        for b in range(len(frames)):
-            frame, inverse = stack[frames[b], first + i], stack[max(inverses[b], 0), first + i]
-            _measure_heights(frame, inverse, inverses[b] >= 0, background[i], heights)
-            _extend_ranges(place, heights, np.float32(spans[b]), np.float32(guard), ranges)
-        _mask_ranges(background[i], noise_a, noise_b, ranges, reason[i])
+        for begin in range(0, phase.shape[1], CHUNK_PX):
+            chunk = slice(begin, begin + CHUNK_PX)
+            ranges[0][:], ranges[1][:], ranges[2][:], ranges[3][:] = 0, UNSEEN, 0, UNSEEN
+            level = background[i, chunk]
+            _number_edges(phase[i, chunk], to_px, origin, spacing, guard, edges)
+            for b in range(len(frames)):
+                frame = stack[frames[b], first + i, chunk]
+                inverse = stack[max(inverses[b], 0), first + i, chunk]
+                _measure_heights(frame, inverse, inverses[b] >= 0, level, heights)
+                _extend_ranges(edges, heights, bits[b], len(level), ranges)
+            _mask_ranges(level, noise_a, noise_b, ranges, reason[i, chunk])
+
+
+@kernel()
+def _number_edges(phase, to_px, origin, spacing, guard, edges):
+    """Fill ``edges`` with the number of the edge that a pixel is within ``guard`` px of, counted
+    from the code's origin; 0 where there is none.
+
+    Edges of all bits are ``spacing`` px apart, more than twice the guard.
+    """
+    scale, offset = np.float32(to_px / spacing), np.float32(origin / spacing)
+    share = np.float32(guard / spacing)
+    for x in range(len(phase)):
+        place = phase[x] * scale - offset
+        nearest = np.floor(place + np.float32(0.5))
+        # false for NaN as well
+        edges[x] = np.int32(nearest if abs(place - nearest) < share else np.float32(0))
 
 
 @kernel()
 def _measure_heights(frame, inverse, has_inverse, background, heights):
-    """Fill ``heights`` (w,): levels of a bit above black and white's mean, which the inverse, if
-    there is one, or the background shows."""
+    """Fill ``heights``: levels of a bit above black and white's mean, which the inverse, if there
+    is one, or the background shows."""
     if has_inverse:
-        for x in range(len(heights)):
+        for x in range(len(frame)):
             heights[x] = abs(np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
     else:
-        for x in range(len(heights)):
+        for x in range(len(frame)):
             heights[x] = np.float32(frame[x]) - background[x]
 
 
 @kernel()
-def _extend_ranges(place, heights, span, guard, ranges):
-    """Extend the ranges of a row's levels, most and least of white and of black, by those of a bit
-    of this ``span``, px, that are farther than ``guard`` from its edges."""
+def _extend_ranges(edges, heights, bit, count, ranges):
+    """Extend the ranges of ``count`` levels, most and least of white and of black, by those of a
+    bit where it has no edge: of those that are numbered by ``bit`` and its odd multiples."""
     most_white, least_white, most_black, least_black = ranges
-    per_span, none = np.float32(1) / span, np.float32(0)
-    for x in range(len(place)):
-        turns = place[x] * per_span
-        is_far = abs(turns - np.floor(turns) - np.float32(0.5)) * span >= guard
-        height = heights[x]
-        white = height if is_far & (height > none) else none
-        black = -height if is_far & (height <= none) else none
-        some_white = white if white > none else UNSEEN
-        some_black = black if is_far & (height <= none) else UNSEEN
+    digits, none = np.int32(2 * bit - 1), np.float32(0)
+    for x in range(count):
+        is_far = (edges[x] & digits) != bit
+        height = heights[x] if is_far else none
+        some_white = height if height > none else UNSEEN
+        some_black = -height if is_far & (height <= none) else UNSEEN
         # all are read before one is written: else the compiler takes them one by one
         a, b, c, d = most_white[x], least_white[x], most_black[x], least_black[x]
-        most_white[x] = white if white > a else a
+        most_white[x] = height if height > a else a
         least_white[x] = some_white if some_white < b else b
-        most_black[x] = black if black > c else c
+        most_black[x] = -height if -height > c else c
         least_black[x] = some_black if some_black < d else d
 
 
