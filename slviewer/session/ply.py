@@ -16,6 +16,8 @@ from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_input
 PLACE, NORMAL, COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
+CHUNK = 1 << 15
+"""Points that are packed at a time, in the processor's cache."""
 UNKNOWN_SIGMA = -1.0
 """Value of an unknown standard deviation: no NaN is written, and 0 would claim too much."""
 
@@ -54,8 +56,9 @@ def write_ply(
     """
     points = np.asarray(points)
     fields = _vertex_fields(points, colours, normals, scalars or {})
-    # grouped: written faster
-    vertex = np.dtype([("+".join(names), code, (len(names),)) for names, code, _ in fields])
+    # as groups of plain bytes, which are packed in half of the time
+    sizes = [np.dtype(code).itemsize * len(names) for names, code, _ in fields]
+    vertex = np.dtype([(f"{i}", f"V{size}") for i, size in enumerate(sizes)])
     types = {code: name for name, code in TYPES.items()}
     header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm"]
     header += [
@@ -72,12 +75,13 @@ def write_ply(
     header.append("end_header\n")
     with arriving_file(Path(path), size) as file:
         file.write("\n".join(header).encode("ascii"))
-        records = np.empty(len(points), vertex)
-        for names, _, values in fields:
-            records["+".join(names)] = replace_nan(
-                names[0], values if values.ndim == 2 else values[:, None]
-            )
-        file.write(records.data)
+        records = np.empty(min(len(points), CHUNK), vertex)
+        for begin in range(0, len(points), CHUNK):
+            chunk = records[: len(points) - begin]
+            for i, (names, code, values) in enumerate(fields):
+                some = replace_nan(names[0], values[begin : begin + CHUNK])
+                chunk[f"{i}"] = np.ascontiguousarray(some, code).reshape(-1).view(vertex[i])
+            file.write(chunk.data)
         if faces is not None:
             triangles = np.empty(len(faces), FACE)
             triangles["count"], triangles["vertices"] = 3, faces
@@ -217,6 +221,8 @@ def _vertex_fields(
             raise InputError(f"Colours of {values.dtype} were given: they must be uint8.")
         if len(names) == 1:
             _check_scalar(what, values, [name for before, _, _ in fields for name in before])
+        elif values.ndim == 1:
+            values = np.repeat(values, len(names)).reshape(shape)
         fields.append((names, code, values))
     return fields
 
