@@ -448,8 +448,8 @@ def _fit_strength(strength: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, 
     terms = (terms - middle) / size
     weight, rest = np.ones(len(terms)), strength
     for _ in range(20):
-        penalty = np.diag(PENALTIES) * weight.sum()
-        normal, moment = (terms.T * weight) @ terms + penalty, (terms.T * weight) @ strength
+        penalty, weighted = np.diag(PENALTIES) * weight.sum(), terms.T * weight
+        normal, moment = weighted @ terms + penalty, weighted @ strength
         fit = np.linalg.solve(normal, moment)
         if fit[-1] > 0:
             fit = np.append(np.linalg.solve(normal[:-1, :-1], moment[:-1]), 0.0)

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from slviewer.fringe.cosines import cosine_columns, fit_common_harmonics, fit_cosine
+from slviewer.fringe.cosines import compute_median, cosine_columns, fit_common_harmonics, fit_cosine
 from slviewer.fringe.layout import Layout
 
 ROWS = 20
@@ -158,7 +158,7 @@ def _bin_variances(
     to_mean = (1 - 2 / (9 * freedom)) ** 3  # the median of chi squared over its mean
     return (
         np.array([levels[b].mean() for b in bins], np.float64),
-        np.array([np.median(variances[b]) for b in bins], np.float64) / to_mean,
+        np.array([compute_median(variances[b]) for b in bins]) / to_mean,
         np.array([len(b) for b in bins], np.float64),
     )
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slviewer.fringe.cosines import compute_median
 from slviewer.fringe.phase import PhaseMap, Reason
 
 WINDOW = 16
@@ -122,14 +123,12 @@ def _measure_blockiness(third: np.ndarray, first: np.ndarray) -> float:
     """
     offset = (first[:, None] + np.arange(third.shape[2])) % BLOCK
     size = third.mean(axis=1)
-    sizes = np.array(
-        [np.median(size[offset == k]) if (offset == k).any() else np.nan for k in range(BLOCK)]
-    )
+    sizes = np.array([compute_median(size[offset == k]) for k in range(BLOCK)])
     if not np.isfinite(sizes).all():
         return 1.0
     k = int(np.argmax(sizes))
     # A pattern of columns that repeats every two or four is the sensor's.
-    return float(sizes[k] / max(np.median(sizes), sizes[(k + BLOCK // 2) % BLOCK], 1e-12))
+    return float(sizes[k] / max(compute_median(sizes), sizes[(k + BLOCK // 2) % BLOCK], 1e-12))
 
 
 def _compute_window_variance(values: np.ndarray) -> np.ndarray:
