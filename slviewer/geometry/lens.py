@@ -18,6 +18,11 @@ LARGEST_PX = 100_000
 LARGEST_DISTORTION = 1e9
 """Of k3 of a telephoto lens, which multiplies the sixth power of a small angle."""
 
+CACHED_BYTES = 64_000_000
+"""Largest size of the rays of an image, of 4 megapixels, that are kept for the next lens that is
+equal: a calibration is read again for each scan."""
+_LAST_RAYS: list[tuple[tuple[bytes, tuple[int, int]], np.ndarray]] = []
+
 
 @dataclass(frozen=True, eq=False)
 class Lens:
@@ -135,9 +140,16 @@ class Lens:
     @cached_property
     def _rays(self) -> np.ndarray:
         """(h, w, 2) float64: undistorted normalised coordinates of every pixel, read-only."""
+        key = self.parameters.tobytes(), self.size
+        for parameters, rays in _LAST_RAYS:
+            if parameters == key:
+                return rays
         width, height = self.size
         v, u = np.mgrid[:height, :width]
-        return read_only(self.undistort(np.stack([u, v], axis=-1)))
+        rays = read_only(self.undistort(np.stack([u, v], axis=-1)))
+        if rays.nbytes <= CACHED_BYTES:
+            _LAST_RAYS[:] = [(key, rays)]
+        return rays
 
     def resize(self, factor: float) -> "Lens":
         """Return the same lens at another resolution: pixel centres stay at whole numbers, so c' =

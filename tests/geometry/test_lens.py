@@ -131,3 +131,11 @@ def test_wrong_shapes_are_refused(lens: Lens) -> None:
         lens.project(np.zeros((5, 2)))
     with pytest.raises(InputError):
         lens.undistort(np.zeros((5, 3)))
+
+
+def test_rays_are_shared_by_equal_lenses() -> None:
+    first, equal, other = Lens(K, D, (40, 30)), Lens(K, D, (40, 30)), Lens(K, D, (30, 40))
+    rays = first.rays()
+    assert equal.rays() is rays
+    assert other.rays().shape == (40, 30, 2)
+    assert not np.array_equal(Lens(K, 0 * D, (40, 30)).rays(), rays)
