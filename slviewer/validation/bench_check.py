@@ -35,17 +35,17 @@ from slviewer.validation.bench_scaling import save_scans
 from slviewer.validation.proof import track
 
 LIMITS = {
-    "decode, kernel / floor": 3.6,
-    "decode, whole / kernel": 4.9,
-    "examine a capture / kernel": 4.5,
-    "noise and fringe mean, sampled / kernel": 0.45,
+    "decode, kernel / floor": 3.5,
+    "decode, whole / kernel": 4.2,
+    "examine a capture / kernel": 4.6,
+    "noise and fringe mean, sampled / kernel": 0.4,
     "second pass, over spikes / kernel": 0.32,
     "one pass, pixelwise / floor": 3.3,
-    "write points as PLY / floor": 5.2,
-    "reconstruct again in the process / kernel": 110.0,
+    "write points as PLY / floor": 4.5,
+    "reconstruct again in the process / kernel": 86.0,
     "align 1.4 M points / kernel": 270.0,
-    "`slviewer --help` / Python's start": 77.0,
-    "`slviewer reconstruct` / Python's start": 420.0,
+    "`slviewer --help` / Python's start": 51.0,
+    "`slviewer reconstruct` / Python's start": 310.0,
 }
 """Largest ratio of each stage: 1.5 times what was measured when it was last made faster. Lower a
 limit where its stage became faster; raise one only for what the stage now does more."""
