@@ -113,7 +113,7 @@ def turn_plan(rig: SimulatedRig, board: Board, poses: int) -> dict[str, Scene]:
         f"pose_{i:02d}": printed_board(board, pose, seed=rig.seed)
         for i, pose in enumerate(target_poses(rig, board, poses), 1)
     }
-    return {**targets, **objects(moved=True), **turning()}
+    return {**targets, **objects("moved_objects"), **turning()}
 
 
 def save_true_stereo(store: Session, rig: SimulatedRig, **other: np.ndarray) -> None:

@@ -4,6 +4,7 @@ every time."""
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -91,15 +92,17 @@ def spheres() -> dict[str, Spheres]:
     return {f"sphere_{i}": sphere(centre) for i, centre in enumerate(_PLANS["spheres"], 1)}
 
 
-def objects(moved: bool = False) -> dict[str, MeshScene]:
-    """Return the demo object in R1, R2 and R3, each time turned a little: the Letter's experiment
-    3.
+def objects(
+    plan: Literal["objects", "moved_objects", "shown_objects"] = "objects",
+) -> dict[str, MeshScene]:
+    """Return the demo object at three depths, each time turned a little.
 
-    ``moved``: turned by up to 15 degrees from one to the next, and placed beside the axis.
+    In R1, R2 and R3 as in the Letter's experiment 3; ``moved_objects``: turned there by up to 15
+    degrees from one to the next, and placed beside the axis; ``shown_objects``: near, middle and
+    far of the depths that the wizard's suggested poses calibrate.
     """
     return {
-        name: demo_object(pose_at(turns, middle))
-        for name, (middle, turns) in _PLANS["moved_objects" if moved else "objects"].items()
+        name: demo_object(pose_at(turns, middle)) for name, (middle, turns) in _PLANS[plan].items()
     }
 
 

@@ -111,7 +111,7 @@ class Autopilot(Service):
         """Scan the simulated object at three distances, and merge the scans."""
         operator = self._operator
         before = self._list_scans("scan")
-        for label, scene in zip(("near", "middle", "far"), objects().values(), strict=True):
+        for label, scene in objects("shown_objects").items():
             self._place("object", scene)
             self._perform_act(
                 f"Scanning the object, {label}", operator.capture_scan, f"Ammonite, {label}"
