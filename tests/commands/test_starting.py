@@ -93,9 +93,9 @@ def last(x: int = 1) -> int:
     return x
 WIDTH: int = 4
 '''
-    (tmp_path / "made_up.py").write_text(source)
+    (tmp_path / "made_up_module.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
-    module = _Module("made_up")
+    module = _Module("made_up_module")
     assert module["WIDTH"] == 4 and module["TEXT"] == "\ndef other(:\n"
     assert module.find_node("NAME") is None
     definition = module.find_node("last")
