@@ -111,7 +111,8 @@ class Inspection(Record, frozen=True, kw_only=True):
         for decision in ("fail", "undecided"):
             if names := [each.part for each in self.parts if each.decision == decision]:
                 listed.append(f"{len(names)} {decision} ({', '.join(names)})")
-        return f"of {len(self.parts)} parts {', '.join(listed)}" if listed else ""
+        count = len(self.parts)
+        return f"{', '.join(listed)} of {count} part{'s' * (count > 1)}" if listed else ""
 
     @property
     def is_good(self) -> bool:
