@@ -30,20 +30,20 @@ SWITCHED_OFF = "SLVIEWER_NO_PREPARATION"
 """Environment variable that, set to anything, prevents the process."""
 COMMAND = [sys.executable, "-m", "slviewer.wizard.preparation"]
 SECONDS = {
-    "coded_rows": 18.0,
-    "_list_rows": 4.0,
-    "_fit_paper_level": 4.0,
-    "_fit_plane": 3.0,
+    "coded_rows": 10.0,
+    "_list_rows": 5.0,
     "_add_samples": 5.0,
-    "_predict": 4.5,
-    "_measure_centroids": 4.0,
+    "evaluate": 4.5,
+    "_measure_centroids": 4.5,
     "fit_rational": 4.0,
-    "_accumulate": 3.0,
     "_fill_rows": 3.0,
+    "add_surface": 2.5,
+    "_accumulate": 2.5,
+    "_fit_paper_level": 2.5,
 }
 """Seconds, roughly, that the compiler takes for the slowest kernels on one core of a server: only
 their shares of the whole matter."""
-OTHERS, OTHER_S = 150, 0.7
+OTHERS, OTHER_S = 123, 0.6
 """How many more there are, by name and signature, and the seconds of each, roughly."""
 REPORT_S = 0.5
 PATIENCE_S = 3600.0
