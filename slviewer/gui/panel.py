@@ -129,7 +129,7 @@ class PanelContext:
 
     def offer_frame(self, name: str) -> str:
         """Return the attributes of a capture's picture by which the page reads its frame's pixels;
-        none where there is no such frame."""
+        empty where its file is missing."""
         with suppress(SlviewerError):
             capture = self.session.load_capture(name)
             path, size = capture.frame_file(capture.brightest_frame)

@@ -236,7 +236,7 @@ def help_link(anchor: str, page: str = FINDINGS_PAGE, style: str = "") -> Html:
 
 
 def thumbnail(jpeg: bytes, width_px: int, alt: str, frame: str = "") -> Html:
-    """Return a small picture inside HTML; an empty box where there is no JPEG yet. ``frame``: the
+    """Return a small picture inside HTML; an empty box until there is a JPEG. ``frame``: the
     attributes by which the page reads the pixels of the whole frame."""
     height = round(0.75 * width_px)
     if not jpeg:

@@ -24,7 +24,7 @@
       name(label, { role: "button", tabindex: 0, "aria-expanded": !label.querySelector(".tabler-icon-chevron-down") });
     const markers = document.querySelectorAll("[data-live]");
     if (!markers.length) liveSize = "";
-    for (const marker of markers) name(marker, liveSize ? { "data-live": liveSize } : {});
+    if (liveSize) for (const marker of markers) name(marker, { "data-live": liveSize });
     for (const image of document.querySelectorAll(LIVE))
       name(image, { role: "button", tabindex: 0, "aria-label": "Camera image", title: "Click to enlarge or shrink" });
     for (const label of document.querySelectorAll("label[for]"))

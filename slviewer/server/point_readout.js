@@ -115,7 +115,7 @@
         const [x, y] = dragged?.begin ?? [];
         if (dragged && !dragged.isMoved && Math.hypot(event.clientX - x, event.clientY - y) >= LEAST_STEP_PX) {
           dragged.isMoved = true;
-          event.target.dispatchEvent(new PointerEvent("pointercancel", event)); // it is no click
+          event.target.dispatchEvent(new PointerEvent("pointercancel", event)); // not a click
         }
         move(event);
         return Boolean(dragged);

@@ -1,7 +1,7 @@
 """What panels draw from a session beyond the snapshot: clouds, error maps, curves, surfaces to
 measure on. Nothing here changes the session."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -200,15 +200,17 @@ def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> 
     None where the ray passes the surface.
     """
     index = nearest(on.points, origin, direction)
-    if index is None:
-        return None
-    return (index[1], index[0]) if on.organised else index[0]
+    return None if index is None else _to_place(on, index)
 
 
 def snap(on: MeasuredSurface, point: np.ndarray) -> Place:
     """Return the place of the measured point closest to a point (3,) mm."""
     off = ((on.points - point) ** 2).sum(axis=-1)
-    index = [int(i) for i in np.unravel_index(np.nanargmin(off), off.shape)]
+    return _to_place(on, [int(i) for i in np.unravel_index(np.nanargmin(off), off.shape)])
+
+
+def _to_place(on: MeasuredSurface, index: Sequence[int]) -> Place:
+    """Return the place of the point with this index, (v, u) of an organised surface."""
     return (index[1], index[0]) if on.organised else index[0]
 
 

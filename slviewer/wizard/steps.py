@@ -178,12 +178,11 @@ def _calibrate(now: Snapshot) -> Outlook:
     problems."""
     session, calibration, n = now.content, now.content.calibration, now.content.good_poses
     problems, blocked, done = _stale_calibration(now), "", False
-    plural = "s" * (n != 1)
     if calibration is None:
-        blocked, instruction = _no_target(now), f"Calibrate from {n} pose{plural}."
+        blocked, instruction = _no_target(now), f"Calibrate from {format_count(n, 'pose')}."
         if not blocked and n < MIN_POSES:
             needed = f"at least {MIN_POSES} are needed: capture the board first."
-            blocked = f"{n} good pose{plural} so far, {needed}"
+            blocked = f"{format_count(n, 'good pose')} so far, {needed}"
     elif calibration.stale:
         instruction = f"Calibrate again from {n} poses."
     else:
