@@ -134,6 +134,7 @@ class PanelContext:
             capture = self.session.load_capture(name)
             path, size = capture.frame_file(capture.brightest_frame)
             address = self.server.downloads.offer(path, within=capture.folder)
+            address += f"#{capture.hash[:8]}"  # the page reads a capture again that was retaken
             return f'data-frame="{address}" data-width="{capture.size[0]}" data-bytes="{size}"'
         return ""
 

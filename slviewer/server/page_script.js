@@ -143,6 +143,7 @@ history.replaceState = () => {};
     const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry()).filter(Boolean);
     if (!entries.length) return;
     event.preventDefault();
+    if (!document.querySelector(input)) return; // a page that only watches
     const found = (await Promise.all(entries.map(list))).flat();
     const [first] = entries;
     const single = entries.length === 1 && first.isFile && !image.test(first.name);
