@@ -143,14 +143,14 @@ history.replaceState = () => {};
     const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry()).filter(Boolean);
     if (!entries.length) return;
     event.preventDefault();
-    if (!document.querySelector(input)) return; // a page that only watches
     const found = (await Promise.all(entries.map(list))).flat();
     const [first] = entries;
     const single = entries.length === 1 && first.isFile && !image.test(first.name);
     const given = new DataTransfer();
     given.items.add(single ? found[0].file : new File([await zip(found)], `${first.name}.zip`));
-    let target; // looked for last: the page may have drawn it anew meanwhile
-    while (!(target = document.querySelector(input))) await new Promise((done) => setTimeout(done, 100));
+    let target; // looked for last, and for 30 s: the page may be drawing it anew; one that only watches has none
+    for (let tries = 300; !(target = document.querySelector(input)); await new Promise((done) => setTimeout(done, 100)))
+      if (!tries--) return;
     target.files = given.files;
     target.dispatchEvent(new Event("change", { bubbles: true }));
   });
