@@ -19,11 +19,12 @@ from slviewer.simulation.boards import (
     printed_board,
 )
 from slviewer.simulation.concave import CONCAVE
-from slviewer.simulation.decals import MarkedScene, marked_plate
-from slviewer.simulation.mesh import MeshScene, demo_object
+from slviewer.simulation.decals import marked_plate
+from slviewer.simulation.mesh import demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.simulation.scenes import Scene, Spheres, sphere
+from slviewer.simulation.scenes import Scene, sphere
+from slviewer.simulation.second_camera import move_scene, pose_of
 from slviewer.simulation.turning import stone_on_table, turn_pose, turning
 from slviewer.target.board import Board
 
@@ -129,11 +130,7 @@ class SimulatedWorld:
     @property
     def pose(self) -> Pose:
         """T_camera_thing of the thing in view; identity rotation for a sphere."""
-        scene = self.scene
-        if isinstance(scene, Spheres):
-            return Pose(np.eye(3), scene.centres[0])
-        assert isinstance(scene, BoardScene | MeshScene | MarkedScene)
-        return scene.pose
+        return pose_of(self.scene)
 
     @property
     def turn_deg(self) -> float:
@@ -165,7 +162,7 @@ class SimulatedWorld:
         with self._lock:
             scene = self._things[thing] if thing in self._things else _make_scene(thing)
             if pose is not None:
-                scene = _move_scene(scene, pose)
+                scene = move_scene(scene, pose)
             self._standing = thing
             self._store_scene(thing, scene)
 
@@ -215,16 +212,6 @@ class SimulatedWorld:
             if thing == self._standing:
                 self._moved = self._clock()
                 self._renderers.clear()
-
-
-def _move_scene(scene: Scene, pose: Pose) -> Scene:
-    """Return a scene moved to another pose; of a sphere only the centre moves."""
-    if isinstance(scene, Spheres):
-        return replace(scene, centres=pose.t[None].astype(float))
-    if isinstance(scene, MarkedScene):
-        return replace(scene, scene=_move_scene(scene.scene, pose), pose=pose)
-    assert isinstance(scene, BoardScene | MeshScene)
-    return replace(scene, pose=pose)
 
 
 def _make_scene(thing: Thing) -> Scene:

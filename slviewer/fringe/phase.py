@@ -41,6 +41,8 @@ class Reason(IntEnum):
     INDIRECT = 5
     """The frames contradict a single reflection: much of the light came from other surfaces or
     through the material."""
+    UNSEEN = 6
+    """The second camera does not see the point, or sees an edge there."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,9 @@ class PhaseMap:
     width of its cells. ``unambiguous_px``: the coordinate is known only modulo so many px of the
     projector; infinite where it is absolute. ``model_error_rad``: rms error of the phase that gamma
     leaves, beside noise. ``sigma_scale``: factor by which neighbouring pixels scatter more than
-    both predict, 1 where they do not (see `scatter`).
+    both predict, 1 where they do not (see `scatter`). ``sigma_known``: (h, w) float32 rad, the
+    standard deviation of a phase that was not decoded from these maps (see
+    `reconstruction.camera_match`).
     """
 
     axis: Axis
@@ -70,6 +74,7 @@ class PhaseMap:
     unambiguous_px: float = np.inf
     model_error_rad: float = 0.0
     sigma_scale: float = 1.0
+    sigma_known: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Raise InputError unless all maps have the same shape (h, w)."""
@@ -108,7 +113,9 @@ class PhaseMap:
         sqrt(2 / n) sigma_I / B and `model_error_rad` in quadrature, times `sigma_scale`; 2 pi /
         sqrt(12) for Gray code alone.
         """
-        if self.steps == 0:
+        if self.sigma_known is not None:
+            sigma = self.sigma_known
+        elif self.steps == 0:
             sigma = np.full_like(self.phase, 2 * np.pi * GRAY_SIGMA_CELLS)
         else:
             a, b = self.noise

@@ -312,6 +312,7 @@ REASONS = {
     ),
     Reason.OUTSIDE: "the coordinate lies outside of the projector",
     Reason.INDIRECT: "much of the light came by way of other surfaces or through the material",
+    Reason.UNSEEN: "the second camera does not see the point, or sees an edge there",
 }
 """What the codes of the files `reason_<axis>` stand for."""
 _UNITS = {

@@ -227,6 +227,7 @@ REASON_LABELS = {
     Reason.INCONSISTENT: "inconsistent",
     Reason.OUTSIDE: "outside of the projector",
     Reason.INDIRECT: "indirect light",
+    Reason.UNSEEN: "not seen by the second camera",
 }
 REASON_COLOURS = {
     Reason.DARK: "#3a424b",
@@ -234,6 +235,7 @@ REASON_COLOURS = {
     Reason.INCONSISTENT: "#ff8ad8",
     Reason.OUTSIDE: "#ffffff",
     Reason.INDIRECT: "#ff9a1f",
+    Reason.UNSEEN: "#4f9dde",
 }
 """None of them occurs in the colour scale of the coordinates."""
 _AROUND_PX = 96  # titles above, the legend below

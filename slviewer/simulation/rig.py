@@ -103,14 +103,13 @@ def letter(
     if texture not in ("coarse", "fine"):
         raise InputError(f"the local distortion's texture is coarse or fine, not {texture!r}")
     preset = tomllib.loads(asset("simulation/letter.toml").read_text(encoding="utf-8"))
-    local = preset["local_distortion"]
-    rms = local["rms_px"] if local_distortion_px is None else local_distortion_px
+    rms = local_distortion_px
     streams = np.random.SeedSequence([seed, 0x51]).spawn(3)
     camera, projector = (
-        _sample_lens(np.random.default_rng(stream), preset[name], local, tuple(local[texture]), rms)
+        sample_device(stream, preset, name, texture, rms)
         for name, stream in zip(("camera", "projector"), streams[:2], strict=True)
     )
-    R, t = _compute_arrangement(np.random.default_rng(streams[2]), preset["arrangement"])
+    R, t = sample_arrangement(streams[2], preset, "arrangement")
     given = {
         name: value for name, value in (("gamma", gamma), ("flicker", flicker)) if value is not None
     }
@@ -119,15 +118,17 @@ def letter(
     return SimulatedRig(camera, projector, R, t, Sensor(**preset["sensor"]), light, seed)
 
 
-def _sample_lens(
-    rng: np.random.Generator,
-    device: dict[str, Any],
-    local: dict[str, Any],
-    wavelengths: tuple[float, float],
-    rms: float,
+def sample_device(
+    stream: np.random.SeedSequence,
+    preset: dict[str, Any],
+    name: str,
+    texture: str = "coarse",
+    rms: float | None = None,
 ) -> SimulatedLens:
-    """Sample a random lens of a device as its preset describes: with Brown distortion and local
-    waves."""
+    """Sample a random lens of a preset's device: with Brown distortion and local waves of ``rms``
+    px, by default the preset's."""
+    rng, device, local = np.random.default_rng(stream), preset[name], preset["local_distortion"]
+    rms = local["rms_px"] if rms is None else rms
     width, height = device["size"]
     focal = np.array(device["focal_px"]) * (1 + device["focal_spread"] * rng.uniform(-1, 1))
     middle = np.array([(width - 1) / 2, (height - 1) / 2]) + device["centre_offset_px"]
@@ -135,15 +136,16 @@ def _sample_lens(
     spread = np.array(device["distortion_spread"]) * rng.uniform(-1, 1, 5)
     k1, k2, p1, p2, k3 = (np.array(device["distortion"]) + spread).tolist()
     (fx, fy), (cx, cy), size = focal.tolist(), centre.tolist(), (width, height)
-    waves = random_waves(rng, size, fy / fx, local["waves"], wavelengths, rms)
+    waves = random_waves(rng, size, fy / fx, local["waves"], tuple(local[texture]), rms)
     return SimulatedLens(size, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3), waves)
 
 
-def _compute_arrangement(
-    rng: np.random.Generator, arrangement: dict[str, Any]
+def sample_arrangement(
+    stream: np.random.SeedSequence, preset: dict[str, Any], name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """R and t: the projector at the baseline's length, its axis through the camera's axis at the
-    crossing depth."""
+    """R and t of a preset's arrangement: the device at the baseline's length, its axis through the
+    camera's axis at the crossing depth."""
+    rng, arrangement = np.random.default_rng(stream), preset[name]
     direction = np.array(arrangement["direction"])
     centre = arrangement["baseline_mm"] * direction / np.linalg.norm(direction)
     roll, pan, nod = np.radians(arrangement["spread_deg"]) * rng.uniform(-1, 1, 3)
