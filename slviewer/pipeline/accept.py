@@ -42,6 +42,7 @@ from slviewer.pipeline.capture_phases import (
     check_capture,
     decode_capture,
     look_at_capture,
+    match_second,
 )
 from slviewer.pipeline.feedback import Progress, part, stage
 from slviewer.pipeline.models import (
@@ -257,9 +258,10 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     shot = store.load_capture(capture)
     job.progress(0.0, f"reading {capture}")
     look = look_at_capture(shot)
-    frames, phases = look.stack, decode_capture(shot, look)
-    check_capture(capture, shot.sequence, frames, phases, files=shot.files)
-    check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
+    frames, decoded = look.stack, decode_capture(shot, look)
+    check_capture(capture, shot.sequence, frames, decoded, files=shot.files)
+    phases = match_second(shot, decoded, stereo.rig)
+    check_sizes(capture, shot.size, shot.other_size, stereo.rig)
     board = Board.parse(stereo.board)
     detection = detect(board, capture_texture(shot, frames))
     calibrated = CalibrateSettings(**load_record(store, ModelCalibration, "stereo").settings)

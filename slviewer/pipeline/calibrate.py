@@ -176,6 +176,7 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
         read_stored_poses(store, names, board, settings.step_2),
         len(names),
         first.sequence,
+        first.other_size or first.sequence.projector,
         board,
         excluded,
         part(job.progress, 0, 0.65),
@@ -245,7 +246,8 @@ def calibrate_frames(
         for name, frames in poses.items()
         for look in (look_at(sequence, frames),)
     )
-    diagnosed = _diagnose_poses(judged, len(poses), sequence, board, {}, part(progress, 0, 0.65))
+    count, size = len(poses), sequence.projector
+    diagnosed = _diagnose_poses(judged, count, sequence, size, board, {}, part(progress, 0, 0.65))
     result = _fit_models(diagnosed, settings, part(progress, 0.66, 1.0), warn)
     if result.is_rejected:
         raise rejection_error(result.verdict, is_saved=False)
@@ -339,19 +341,20 @@ def _diagnose_poses(
     poses: Iterable[Judged],
     count: int,
     sequence: PatternSequence,
+    other_size: tuple[int, int],
     board: Board,
     excluded: Mapping[str, str],
     progress: Progress,
     camera: KnownCamera | None = None,
 ) -> DiagnosedCalibration:
     """Calibrate stereo from ``count`` target poses as they are read, and judge it. ``excluded``:
-    {pose: why}; ``camera``: a known one."""
+    {pose: why}; ``camera``: a known one; ``other_size``: px of the projector or second camera."""
     try:
         for axis in sequence.axes:
             if sequence.periods_px(axis) and sequence.find("gray", axis):
                 axis_layout(sequence, axis)
     except InputError as error:  # its periods and its Gray code conflict
-        evidence = Evidence(str(board), sequence.projector, (), contradiction=str(error))
+        evidence = Evidence(str(board), other_size, (), contradiction=str(error))
         return DiagnosedCalibration(judge_evidence(evidence), evidence, None, (), dict(excluded))
     judged = list[Judged]()
     for pose in poses:
@@ -361,7 +364,7 @@ def _diagnose_poses(
     result = calibrate_with_diagnosis(
         [pose.observation for pose in judged if pose.observation is not None],
         [pose.evidence for pose in judged if pose.evidence is not None],
-        sequence.projector,
+        other_size,
         board,
         {**excluded, **refused},
         camera,

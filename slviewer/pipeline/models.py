@@ -168,7 +168,7 @@ def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:
             f"{store.folder} holds no capture that states the camera's size: import the scans first"
         )
     camera = tuple(meta["camera"] or captures[0].size)
-    projector = tuple(meta["projector"] or captures[0].sequence.projector)
+    projector = tuple(meta["projector"] or captures[0].other_size or captures[0].sequence.projector)
     m = {name: np.array(value) for name, value in meta["imported"].items()}
     rig = StereoRig(
         Lens(m["K_camera"], m["D_camera"], camera),

@@ -27,6 +27,7 @@ from slviewer.pipeline.capture_phases import (
     compute_ahead,
     decode_capture,
     look_at_capture,
+    match_second,
 )
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.records.plain import to_plain
@@ -43,7 +44,8 @@ EVIDENCE_VERSION = 7
 @dataclass(frozen=True, eq=False)
 class DecodedPose:
     """A look at the frames of a target pose with what they were decoded to; ``texture`` (h, w) or
-    (h, w, 3) uint8 shows the board."""
+    (h, w, 3) uint8 shows the board; ``matched``: what its board is observed by, where that is not
+    the decoded phases but a second camera's coordinates."""
 
     name: str
     sequence: PatternSequence
@@ -51,6 +53,7 @@ class DecodedPose:
     phases: Mapping[Axis, PhaseMap]
     texture: np.ndarray
     board: Board
+    matched: Mapping[Axis, PhaseMap] | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ def read_pose(
     refused, cause = "", ""
     try:
         detection = detect(pose.board, pose.texture)
-        observation = observe(name, pose.board, detection, phases, smoothing)
+        observation = observe(name, pose.board, detection, pose.matched or phases, smoothing)
         if observed is not None:
             observed(observation)
     except InputError as error:
@@ -112,7 +115,8 @@ def read_stored_pose(
     """Decode the frames of a pose, read it as ``read_pose`` does, and save the result and
     the check of the frames in the session."""
     phases, texture = decode_capture(capture, look), capture_texture(capture, look.stack)
-    pose = DecodedPose(capture.name, capture.sequence, look, phases, texture, board)
+    matched = match_second(capture, phases) if capture.second else None
+    pose = DecodedPose(capture.name, capture.sequence, look, phases, texture, board, matched)
     examined = partial(load_or_save_examination, store, capture, look)
     judged = read_pose(pose, smoothing, True, examined, observed)
     inputs = {capture.name: capture.hash}
@@ -174,12 +178,13 @@ def read_stored_poses(
     captures = [store.load_capture(name) for name in names]
     for capture in captures[1:]:
         first = captures[0]
-        if (capture.size, capture.sequence.projector) != (first.size, first.sequence.projector):
+        own, others = ((each.size, _other_size(each)) for each in (capture, first))
+        if own != others or bool(capture.second) != bool(first.second):
+            (a, b), (c, d) = (map(_wxh, each) for each in (own, others))
+            other = "second camera" if capture.second else "projector"
             raise InputError(
-                f"{capture.name} has a {_wxh(capture.size)} camera and a"
-                f" {_wxh(capture.sequence.projector)} projector, {first.name} {_wxh(first.size)}"
-                f" and {_wxh(first.sequence.projector)}: calibrate poses of one rig at one"
-                " resolution"
+                f"{capture.name} has a {a} camera and a {b} {other}, {first.name} {c} and {d}:"
+                " calibrate poses of one rig at one resolution"
             )
     cached = {name: load_judged(store, name, board, smoothing) for name in names}
     missing = [capture for capture in captures if cached[capture.name] is None]
@@ -211,6 +216,12 @@ def _decode_observation(
 ) -> Observation | None:
     """Return the observation in a stored reading; None where the pose was refused."""
     return None if meta["refused"] else Observation.from_arrays(name, arrays)
+
+
+def _other_size(capture: Capture) -> tuple[int, int]:
+    """Return the size px of the device beside the camera. Raises InputError where the projector's
+    is not known."""
+    return capture.other_size or capture.sequence.projector
 
 
 def _wxh(size: tuple[int, int]) -> str:

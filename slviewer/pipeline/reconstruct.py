@@ -128,7 +128,9 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
     check_capture_sizes(store, [capture])
     job.progress(0.1, "reading and decoding")
     shot, frames, decoded = next(
-        decode_captures(store, [capture], warn, relative=True, check=settings.check)
+        decode_captures(
+            store, [capture], warn, relative=True, check=settings.check, rig=load_stereo(store).rig
+        )
     )
     phases = absolute_phases(store, capture, decoded, settings.depth_range, warn)
     is_pose = shot.role == "calibration"
@@ -327,7 +329,9 @@ def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCap
     check_capture_sizes(store, names)
     depths = settings.depth_range or load_stereo(store).depth_range_mm
     for i, (shot, frames, phases) in enumerate(
-        decode_captures(store, names, job.warn, check=settings.check)
+        decode_captures(
+            store, names, job.warn, check=settings.check, rig=load_stereo(store).rig
+        )
     ):
         job.progress(i / len(names), f"measuring {shot.name}")
         # the axis is that of the first, so that all can be compared pixel by pixel
@@ -366,7 +370,7 @@ def check_capture_sizes(store: Session, names: Iterable[str]) -> None:
     rig = load_stereo(store).rig
     for capture in (store.load_capture(name) for name in names):
         capture.require_frames("reconstruct")
-        check_sizes(capture.name, capture.size, capture.sequence.projector_size, rig)
+        check_sizes(capture.name, capture.size, capture.other_size, rig)
 
 
 def capture_cloud(
@@ -389,7 +393,7 @@ def capture_cloud(
     warning.
     """
     stereo = load_stereo(store)
-    check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
+    check_sizes(capture.name, capture.size, capture.other_size, stereo.rig)
     calibration = model if isinstance(model, SplinedModel) else stereo
     check = check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
     for message in (*lens_warnings(store, capture), *check.warnings):
@@ -478,7 +482,8 @@ def reconstruct_captures(
     """
     store = job.store
     check_capture_sizes(store, names)
-    decoded = decode_captures(store, names, job.warn if examine else ignore_warnings)
+    warn, rig = job.warn if examine else ignore_warnings, load_stereo(store).rig
+    decoded = decode_captures(store, names, warn, rig=rig)
     for i, (capture, frames, phases) in enumerate(decoded):
         job.progress(i / len(names), f"{doing} {capture.name}")
         texture = capture_texture(capture, frames, stretch=False)

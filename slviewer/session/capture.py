@@ -2,9 +2,9 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,6 +30,8 @@ from slviewer.session.stack import (
 Role = Literal["calibration", "scan"]
 Purpose = Literal["pose", "scan", "plane", "sphere"]
 """What a capture is made for: all but target poses are scans."""
+SECOND = "second"
+"""Folder in a capture's, a capture itself: what a second camera saw of the same patterns."""
 Comparison = Literal["absent", "same", "damaged", "different"]
 """Of a stored capture with a new one: "damaged" was the same when it was saved."""
 
@@ -137,6 +139,25 @@ class Capture:
         _require_unchanged(self.folder, self.hash)
         return stack
 
+    @cached_property
+    def second(self) -> "Capture | None":
+        """What the second camera saw of the same patterns; None of a rig with one."""
+        if not self.meta.get(SECOND):
+            return None
+        second = read_capture(self.folder / SECOND)
+        if second.hash != self.meta[SECOND]:
+            raise DamagedError(
+                f"{self.name}: the frames of its second camera are not those that were saved with"
+                " it: restore the folder from a copy, or import or record the capture again"
+            )
+        return replace(second, name=f"{self.name}, second camera")
+
+    @property
+    def other_size(self) -> tuple[int, int] | None:
+        """(width, height) px of the device that the camera is calibrated with: the second camera,
+        else the projector, None where that is not known."""
+        return self.sequence.projector_size if self.second is None else self.second.size
+
     def verify(self) -> list[str]:
         """Read everything; returns the hash of each stored frame. Raises DamagedError unless the
         frames and their description are those that were saved."""
@@ -144,11 +165,14 @@ class Capture:
             return []  # its points are those of the result that states its hash
         content, frames = FrameStack.open(self.folder / "frames.zarr").hash()
         described, exposures_ms = self.meta["sequence"], self.meta.get("exposures_ms")
-        if _hash_content(content, described, exposures_ms, self.texture) != self.hash:
+        seen = self.meta.get(SECOND, "")
+        if _hash_content(content, described, exposures_ms, self.texture, seen) != self.hash:
             raise DamagedError(
                 f"{self.name}: what {self.folder} holds is not what was saved (its hash differs):"
                 " restore the folder from a copy, or import or record the capture again"
             )
+        if self.second is not None:
+            self.second.verify()
         return frames
 
     @property
@@ -236,6 +260,7 @@ class _Description:
     exposures_ms: list[Exposure] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
+    second: str = ""
 
 
 @dataclass(frozen=True)
@@ -244,7 +269,8 @@ class NewCapture:
     ``sequence``, or (k n, h, w) of the k ``exposures_ms``, one exposure after the other;
     ``texture`` (h, w, 3) RGB where the scene is known in colour; ``source``: where it comes from;
     ``files``: of an import, relative to that, one a frame. An imported cloud has no frames, (0, h,
-    w) of its rows of points, and their hash as ``settings["cloud"]``.
+    w) of its rows of points, and their hash as ``settings["cloud"]``. ``second``: what a second
+    camera saw of the same sequence, in the same exposures; its name is not used.
     """
 
     name: str
@@ -255,6 +281,7 @@ class NewCapture:
     settings: Mapping[str, Any] = field(default_factory=dict)
     exposures_ms: Sequence[float] = ()
     files: tuple[str, ...] = ()
+    second: "NewCapture | None" = None
 
     @property
     def hash(self) -> str:
@@ -262,12 +289,14 @@ class NewCapture:
         texture, sequence."""
         described, exposures_ms = self.sequence.to_dict(), list(self.exposures_ms)
         frames = hash_frames(self.frames) if len(self.frames) else self.settings["cloud"]
-        return _hash_content(frames, described, exposures_ms, self.texture)
+        seen = self.second.hash if self.second else ""
+        return _hash_content(frames, described, exposures_ms, self.texture, seen)
 
     @property
     def nbytes(self) -> int:
         """Total size of frames and texture, bytes."""
-        return self.frames.nbytes + (0 if self.texture is None else self.texture.nbytes)
+        own = self.frames.nbytes + (0 if self.texture is None else self.texture.nbytes)
+        return own + (self.second.nbytes if self.second else 0)
 
     def merged_frames(self) -> np.ndarray:
         """(n, h, w): of several exposures, each pixel from the longest that did not clip it."""
@@ -284,6 +313,13 @@ class NewCapture:
         exposures, texture, shape = self.exposures_ms, self.texture, self.frames.shape
         if not self.sequence.frames:
             return
+        if self.second is not None:
+            self.second.check()
+            if self.second.sequence != self.sequence:
+                raise InputError(
+                    f"{self.name}: its two cameras saw different patterns: give both the same"
+                    " sequence"
+                )
         check_stack_array(self.frames)
         if (
             len(exposures) == 1
@@ -315,6 +351,11 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
         write_stack(folder / "frames.zarr", frames) if len(frames) else capture.settings["cloud"]
     )
     described = capture.sequence.to_dict()
+    seen = ""
+    if capture.second is not None:
+        (folder / SECOND).mkdir()
+        write_capture(folder / SECOND, capture.second, role, board)
+        seen = capture.second.hash
     if texture is not None:
         import cv2
 
@@ -339,7 +380,8 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
                 "frames": len(frames),
                 **({"exposures_ms": exposures_ms} if exposures_ms else {}),
                 **({"files": capture.files} if capture.files else {}),
-                "hash": _hash_content(frames_hash, described, exposures_ms, texture),
+                **({SECOND: seen} if seen else {}),
+                "hash": _hash_content(frames_hash, described, exposures_ms, texture, seen),
                 "texture": texture is not None,
                 "settings": capture.settings,
                 "sequence": described,
@@ -393,14 +435,16 @@ def _hash_content(
     described: Mapping[str, Any],
     exposures_ms: Sequence[float] | None,
     texture: np.ndarray | None,
+    second: str,
 ) -> str:
     """Return the content hash of a capture from that of its frames, its sequence as plain values,
-    and the rest."""
+    the rest, and the hash of what its ``second`` camera saw."""
     whole = hashlib.blake2b(frames_hash.encode() + to_json(described), digest_size=20)
     if exposures_ms:
         whole.update(to_json(exposures_ms))
     if texture is not None:
         whole.update(np.ascontiguousarray(texture).data)
+    whole.update(second.encode())
     return whole.hexdigest()
 
 

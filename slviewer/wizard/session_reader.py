@@ -233,7 +233,7 @@ class SessionReader:
         """Return what the next pose is planned from; None before target and sizes are known."""
         camera, projector = rig.camera, rig.projector
         for first in [each for each in self._captures.values() if each.role == "calibration"][:1]:
-            camera, projector = first.size, first.sequence.projector_size
+            camera, projector = first.size, first.other_size
         if not target or camera is None or projector is None:
             return None
         stereo = None if calibration is None or calibration.refused else calibration.stereo
