@@ -4,11 +4,12 @@ several."""
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from slviewer.devices.protocols import (
+    Camera,
     CameraSettings,
     ColourCamera,
     Rig,
@@ -28,8 +29,10 @@ def capture_frames(
     out: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
     sleep: Callable[[float], None] = time.sleep,
+    second: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Capture the frames (n, h, w) of `sequence` with the open rig, into `out` if it is given.
+    """Capture the frames (n, h, w) of `sequence` with the open rig, into `out` if it is given, and
+    those of its second camera into `second`.
 
     `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled)
     to stop. `sleep(seconds)` waits for the light to settle. Raises DeviceError, with the frame at
@@ -38,20 +41,20 @@ def capture_frames(
     """
     with report_driver_faults(rig.projector):
         rig.projector.load(sequence)
-    out = _allocate(rig, len(sequence.frames), out)
-    _capture_loaded(rig, out, range(len(out)), progress, sleep)
+    out = _allocate(rig.camera, len(sequence.frames), out)
+    _capture_loaded(rig, (out, second), range(len(out)), progress, sleep)
     return out
 
 
-def _allocate(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
-    """Return `out` if `n` frames of the rig's camera fit it, or a new array (n, h, w). Raises
+def _allocate(camera: Camera, n: int, out: np.ndarray | None = None) -> np.ndarray:
+    """Return `out` if `n` frames of a camera fit it, or a new array (n, h, w). Raises
     InputError."""
-    width, height = rig.camera.size
+    width, height = camera.size
     if out is None:
-        return np.empty((n, height, width), rig.camera.dtype)
-    if out.shape != (n, height, width) or out.dtype != rig.camera.dtype:
+        return np.empty((n, height, width), camera.dtype)
+    if out.shape != (n, height, width) or out.dtype != camera.dtype:
         raise InputError(
-            f"the {n} frames of {rig.camera.name} need {(n, height, width)} {rig.camera.dtype}, "
+            f"the {n} frames of {camera.name} need {(n, height, width)} {camera.dtype}, "
             f"got {out.shape} {out.dtype}: make the array by the camera's size"
         )
     return out
@@ -59,21 +62,24 @@ def _allocate(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
 
 def _capture_loaded(
     rig: Rig,
-    out: np.ndarray,
+    stacks: tuple[np.ndarray, np.ndarray | None],
     places: range,
     progress: Callable[[int, int], None] | None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Show and grab the loaded frames into their `places` in `out` (k, h, w)."""
+    """Show and grab the loaded frames into their `places` in the stacks (k, h, w) of both
+    cameras."""
     report = progress or (lambda done, n: None)
-    report(places.start, len(out))
+    report(places.start, len(stacks[0]))
     for k, place in enumerate(places):
         try:
             with report_driver_faults(rig.projector):
                 rig.projector.show(k)
             settle(rig, sleep)
-            with report_driver_faults(rig.camera):
-                rig.camera.grab(out[place])
+            for camera, out in zip(rig.cameras, stacks, strict=False):
+                if out is not None:
+                    with report_driver_faults(camera):
+                        camera.grab(out[place])
             if k == len(places) - 1:
                 with report_driver_faults(rig.projector):
                     # a change during this exposure is reported by the next request only
@@ -83,7 +89,7 @@ def _capture_loaded(
                 f"the capture ended at frame {k + 1} of {len(places)}, and its frames were"
                 f" discarded: {error}"
             ) from error
-        report(place + 1, len(out))
+        report(place + 1, len(stacks[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +97,7 @@ class CapturedFrames:
     """Result of `capture_with_texture`: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the
     whole sequence in one after the other; the camera's settings; the sequence and the name of the
     rig; a colour texture (h, w, 3), None with a monochrome camera; and what the camera reports of
-    its ``lens``, as `read_lens`.
+    its ``lens``, as `read_lens`. ``second``: the frames of a second camera, in the same order.
     """
 
     frames: np.ndarray
@@ -101,6 +107,7 @@ class CapturedFrames:
     exposures_ms: tuple[float, ...] = ()
     texture: np.ndarray | None = None
     lens: Mapping[str, float] = field(default_factory=dict)
+    second: np.ndarray | None = None
 
 
 def capture_with_texture(
@@ -118,16 +125,18 @@ def capture_with_texture(
     exposures, DeviceError for a camera that cannot be set to them, and whatever `capture_frames`
     raises.
     """
-    if not exposures_ms:
-        return _complete(rig, sequence, capture_frames(rig, sequence, out, progress))
-    wanted = check_exposures(exposures_ms)
-    n = len(sequence.frames)
-    out = _allocate(rig, n * len(wanted), out)
+    wanted, n = check_exposures(exposures_ms) if exposures_ms else [], len(sequence.frames)
+    count = n * max(1, len(wanted))
+    second = None if rig.second is None else _allocate(rig.second, count)
+    if not wanted:
+        out = capture_frames(rig, sequence, out, progress, second=second)
+        return replace(_complete(rig, sequence, out), second=second)
+    out = _allocate(rig.camera, count, out)
     with report_driver_faults(rig.projector):
         # once: a projector reconnected between two exposures must not go unnoticed
         rig.projector.load(sequence)
-    with report_driver_faults(rig.camera):
-        before, applied_ms = rig.camera.settings(), list[float]()
+    applied_ms = list[float]()
+    before = [read_settings(camera) for camera in rig.cameras]
     try:
         for e, exposure in enumerate(wanted):
             applied_ms.append(_set_exposure(rig, exposure))
@@ -136,12 +145,13 @@ def capture_with_texture(
                     f"{rig.camera.name} set {applied_ms[e]:g} ms instead of the requested"
                     f" {exposure:g} ms: choose exposures that it can tell apart, or a single one"
                 )
-            _capture_loaded(rig, out, range(e * n, (e + 1) * n), progress)
+            _capture_loaded(rig, (out, second), range(e * n, (e + 1) * n), progress)
     finally:
         # a lost device raises its own error
-        with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):
-            rig.camera.apply(before)
-    return _complete(rig, sequence, out, tuple(applied_ms))
+        for camera, settings in zip(rig.cameras, before, strict=True):
+            with contextlib.suppress(DeviceError), report_driver_faults(camera):
+                camera.apply(settings)
+    return replace(_complete(rig, sequence, out, tuple(applied_ms)), second=second)
 
 
 def _complete(
@@ -172,15 +182,22 @@ def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
 
 
 def _set_exposure(rig: Rig, exposure_ms: float) -> float:
-    """Set the exposure; returns the value, ms, that the camera applied. Raises DeviceError where it
-    is unknown."""
-    with report_driver_faults(rig.camera):
-        applied_ms = rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
+    """Set the exposure of each camera; returns the value, ms, that the first one applied. Raises
+    DeviceError where it is unknown."""
+    for camera in reversed(rig.cameras):
+        with report_driver_faults(camera):
+            applied_ms = camera.apply(CameraSettings(exposure_ms)).exposure_ms
     if applied_ms is None:
         raise DeviceError(
             f"{rig.camera.name} does not report its exposure: capture in a single one"
         )
     return applied_ms
+
+
+def read_settings(camera: Camera) -> CameraSettings:
+    """Return a camera's settings. Raises DeviceError."""
+    with report_driver_faults(camera):
+        return camera.settings()
 
 
 def capture_colour(rig: Rig) -> np.ndarray | None:

@@ -6,7 +6,7 @@ does not answer, is not open or was unplugged; after that, `close` and `open` ar
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Literal, Protocol, get_args, runtime_checkable
 
@@ -277,8 +277,10 @@ class Openable:
 class Rig:
     """A camera and a projector that view the same scene, under the name that the operator chose.
 
-    `settle_ms` passes between "shown" and the grab: the measured delay of the light after the
-    projector's report. A `turntable` is opened by what uses it: captures do not need it.
+    Of two cameras, the `second` takes a frame of each pattern after the first, and is calibrated in
+    the projector's place. `settle_ms` passes between "shown" and the grab: the measured delay of
+    the light after the projector's report. A `turntable` is opened by what uses it: captures do not
+    need it.
     """
 
     name: str
@@ -286,10 +288,16 @@ class Rig:
     projector: Projector
     settle_ms: float = 0.0
     turntable: Turntable | None = None
+    second: Camera | None = None
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Its cameras, the first one first."""
+        return (self.camera,) if self.second is None else (self.camera, self.second)
 
     @contextmanager
     def opened(self) -> Iterator["Rig"]:
-        """Open both devices for a `with` block, and close them after it in any case."""
+        """Open the devices for a `with` block, and close them after it in any case."""
         self.open()
         try:
             yield self
@@ -297,19 +305,19 @@ class Rig:
             self.close()
 
     def open(self) -> None:
-        """Open both devices, or neither. Raises DeviceError."""
-        with report_driver_faults(self.projector):
-            self.projector.open()
-        try:
-            with report_driver_faults(self.camera):
-                self.camera.open()
-        except BaseException:
-            self.projector.close()
-            raise
+        """Open all devices, or none. Raises DeviceError."""
+        with ExitStack() as opened:
+            devices: tuple[Camera | Projector, ...] = (self.projector, *self.cameras)
+            for device in devices:
+                with report_driver_faults(device):
+                    device.open()
+                opened.callback(device.close)
+            opened.pop_all()
 
     def close(self) -> None:
-        """Close both devices; never raises."""
-        self.camera.close()
+        """Close all devices; never raises."""
+        for camera in self.cameras:
+            camera.close()
         self.projector.close()
 
 

@@ -2,7 +2,7 @@
 `SimulatedWorld`."""
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import msgspec
@@ -19,7 +19,7 @@ from slviewer.devices.protocols import (
     check_level,
     check_sequence,
 )
-from slviewer.devices.world import Shown, SimulatedWorld
+from slviewer.devices.world import SecondView, Shown, SimulatedWorld
 from slviewer.errors import InputError
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -45,8 +45,10 @@ class SimulatedCamera(CameraDriver):
 
     dtype = np.dtype(np.uint8)
 
-    def __init__(self, world: SimulatedWorld) -> None:
-        super().__init__("the simulated camera")
+    def __init__(
+        self, world: SimulatedWorld | SecondView, name: str = "the simulated camera"
+    ) -> None:
+        super().__init__(name)
         self.size = world.rig.camera.size
         self.world = world
         self._settings = AUTO
@@ -169,9 +171,12 @@ class SimulatedTurntable(Openable):
         self._position_deg = deg
 
 
-def simulated_rig(world: SimulatedWorld) -> Rig:
-    """Return the camera and projector that view `world`."""
-    return Rig("simulated", SimulatedCamera(world), SimulatedProjector(world))
+def simulated_rig(world: SimulatedWorld, cameras: Literal[1, 2] = 1) -> Rig:
+    """Return the camera and projector that view `world`, or two cameras."""
+    second = None
+    if cameras == 2:
+        second = SimulatedCamera(world.from_second_camera(), "the second simulated camera")
+    return Rig("simulated", SimulatedCamera(world), SimulatedProjector(world), second=second)
 
 
 def preset_rig(

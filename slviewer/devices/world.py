@@ -24,7 +24,7 @@ from slviewer.simulation.mesh import demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene, sphere
-from slviewer.simulation.second_camera import move_scene, pose_of
+from slviewer.simulation.second_camera import move_scene, pose_of, second_camera
 from slviewer.simulation.turning import stone_on_table, turn_pose, turning
 from slviewer.target.board import Board
 
@@ -205,6 +205,10 @@ class SimulatedWorld:
                 )
             return self._renderers[draft]
 
+    def from_second_camera(self) -> "SecondView":
+        """Return what a second camera sees of this world."""
+        return SecondView(self)
+
     def _store_scene(self, thing: Thing, scene: Scene) -> None:
         """Store a thing's scene; if it is in view, note that it moved and drop its renderers."""
         with self._lock:
@@ -212,6 +216,29 @@ class SimulatedWorld:
             if thing == self._standing:
                 self._moved = self._clock()
                 self._renderers.clear()
+
+
+class SecondView:
+    """A simulated world as its second camera sees it."""
+
+    def __init__(self, world: SimulatedWorld) -> None:
+        self._world, self._camera = world, second_camera(world.rig)
+        self.rig = self._camera.rig
+        self._rendered: tuple[Scene | None, Renderer | None] = (None, None)
+
+    @property
+    def shown(self) -> Shown:
+        """What the projector shows; its seed is this camera's own."""
+        shown = self._world.shown
+        return replace(shown, seed=(*shown.seed, 2))
+
+    def renderer(self, preview: bool) -> Renderer:
+        """Return a renderer of the scene, in full for a preview too."""
+        scene, (rendered, renderer) = self._world.scene, self._rendered
+        if renderer is None or rendered is not scene:
+            renderer = Renderer(self.rig, self._camera.view(scene))
+            self._rendered = scene, renderer
+        return renderer
 
 
 def _make_scene(thing: Thing) -> Scene:

@@ -477,7 +477,8 @@ class LiveImage(Picture):
     def _show(self, preview: PreviewView, picture: np.ndarray, *lines: Html) -> None:
         """Show the picture of a frame, with lines below; what is drawn states the camera's width
         to `image_lens.js`."""
-        self._camera_px = round(preview.image.shape[1] / preview.scale)
+        wide = 1 if preview.second is None else 2
+        self._camera_px = round(wide * preview.image.shape[1] / preview.scale)
         self.set(picture, legend(preview, *lines))
 
 
@@ -485,7 +486,7 @@ def draw_preview(
     preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw the frame (h, w, 3) uint8 with saturated pixels, the detected board and the suggested
-    outline marked.
+    outline marked; a second camera's frame beside it.
 
     The board's features are joined row by row; `ghost_px` is the outline (4, 2) of the suggested
     pose, in camera px.
@@ -504,7 +505,10 @@ def draw_preview(
         _draw_features(picture, preview.board.pixels * to_picture, board)
         corners = np.round(preview.board.outline * to_picture * 16).astype(np.int32)
         cv2.polylines(picture, [corners], True, _DETECTED, 2, cv2.LINE_AA, shift=4)
-    return picture
+    if preview.second is None:
+        return picture
+    beside = cv2.resize(fitted(preview.second), picture.shape[1::-1], interpolation=cv2.INTER_AREA)
+    return np.hstack([picture, beside])
 
 
 def exposure_html(preview: PreviewView) -> Html:

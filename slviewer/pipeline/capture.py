@@ -37,7 +37,7 @@ from slviewer.pipeline.suggest_exposure import (
 )
 from slviewer.records.plain import to_plain
 from slviewer.session.atomic import format_bytes
-from slviewer.session.capture import Capture, Purpose, Role, TurnStep
+from slviewer.session.capture import Capture, NewCapture, Purpose, Role, TurnStep
 from slviewer.session.names import new_name
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -142,7 +142,7 @@ def capture(settings: CaptureSettings) -> Capture:
         bench, sequence = set_up_rig(store, choice, target, settings)
         exposures = settings.exposures
         most = MAX_SUGGESTED if settings.auto_exposure else max(1, len(exposures))
-        check_space(store, bench.rig.camera, len(sequence.frames) * most, name)
+        check_space(store, bench.rig.cameras, len(sequence.frames) * most, name)
         begin = 0.3 if settings.auto_exposure else 0.0
         with bench.rig.opened() as devices:
             set_camera(devices, choice, settings)
@@ -218,15 +218,16 @@ def warn_of_captured(name: str, captured: CapturedFrames | Capture, warn: Warn) 
 
 
 def set_camera(rig: Rig, choice: Choice, settings: RigSettings) -> None:
-    """Set the open rig's camera to the requested values, else to those of its choice; warns of
+    """Set the open rig's cameras to the requested values, else to those of its choice; warns of
     those refused or changed."""
     wanted = applied = settings.camera_settings(choice)
-    with report_driver_faults(rig.camera):
-        if wanted != CameraSettings():
-            applied = rig.camera.apply(wanted)
-        notes = (*list_notes(rig.camera), *list_changed_settings(rig.camera, wanted, applied))
-    for note in notes:
-        settings.warn(note)
+    for camera in rig.cameras:
+        with report_driver_faults(camera):
+            if wanted != CameraSettings():
+                applied = camera.apply(wanted)
+            notes = (*list_notes(camera), *list_changed_settings(camera, wanted, applied))
+        for note in notes:
+            settings.warn(note)
 
 
 def _check_patterns(patterns: str) -> None:
@@ -265,6 +266,12 @@ def save_frames(
     capture."""
     turned = {} if turn_step is None else {"turntable": to_plain(turn_step)}
     lens = {"lens": captured.lens} if captured.lens else {}
+    second = None
+    if captured.second is not None:
+        second = NewCapture(
+            name, captured.sequence, captured.second, source=captured.source,
+            exposures_ms=captured.exposures_ms,
+        )  # fmt: skip
     exposure = {} if captured.exposures_ms else {"exposure_ms": captured.settings.exposure_ms}
     return store.save_capture(
         name,
@@ -276,6 +283,7 @@ def save_frames(
         settings={"purpose": purpose, **exposure, "gain": captured.settings.gain, **lens, **turned},
         board=board,
         exposures_ms=captured.exposures_ms,
+        second=second,
         force=force,
     )
 
@@ -295,17 +303,17 @@ class Space:
         return self.capture_bytes is None or self.free_bytes > 2 * self.capture_bytes
 
 
-def measure_space(store: Session, camera: Camera | None, frames: int | None) -> Space:
-    """Return the free space on the session's disk, and what so many frames of a camera need."""
+def measure_space(store: Session, cameras: Sequence[Camera], frames: int | None) -> Space:
+    """Return the free space on the session's disk, and what so many frames of each camera need."""
     needed = None
-    if camera is not None and frames is not None:
-        needed = frames * camera.size[0] * camera.size[1] * camera.dtype.itemsize
+    if cameras and frames is not None:
+        needed = sum(frames * c.size[0] * c.size[1] * c.dtype.itemsize for c in cameras)
     return Space(shutil.disk_usage(store.folder).free, needed)
 
 
-def check_space(store: Session, camera: Camera, frames: int, name: str) -> None:
+def check_space(store: Session, cameras: Sequence[Camera], frames: int, name: str) -> None:
     """Raise SessionError before anything is captured for which the disk has no room."""
-    space = measure_space(store, camera, frames)
+    space = measure_space(store, cameras, frames)
     if not space.enough:
         raise SessionError(
             f"{name} needs {format_bytes(space.capture_bytes or 0)}, and as much again for its"

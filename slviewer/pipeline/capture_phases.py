@@ -82,8 +82,8 @@ def decode_capture(
 def match_second(
     capture: Capture, phases: dict[Axis, PhaseMap], rig: StereoRig | None = None
 ) -> dict[Axis, PhaseMap]:
-    """Return what a capture is reconstructed from: its decoded ``phases``, or, where two cameras saw
-    it, the coordinates of the second one, as `match_cameras` does.
+    """Return what a capture is reconstructed from: its decoded ``phases``, or, where two cameras
+    saw it, the coordinates of the second one, as `match_cameras` does.
 
     Raises InputError for phases that are not absolute, and for patterns along one axis unless the
     cameras' ``rig`` is known.

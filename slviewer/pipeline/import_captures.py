@@ -25,7 +25,7 @@ from slviewer.fringe.phase import Reason
 from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.capture_phases import decode_capture, decode_examined
+from slviewer.pipeline.capture_phases import decode_capture, decode_examined, match_second
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Warn, ignore_warnings
@@ -46,6 +46,7 @@ from slviewer.session.importers.imported import (
     define_layout,
     list_folders,
     none_usable,
+    pair_cameras,
 )
 from slviewer.session.importers.layouts import (
     LAYOUT_PLUGINS,
@@ -140,7 +141,9 @@ def import_captures(settings: ImportSettings) -> list[str]:
                 skipped.append(Skipped(recording.name, str(error)))
                 continue
             assumptions.update(dict.fromkeys(_list_assumptions(recording, capture)))
-            capture = replace(capture, sequence=sequence, source=settings.origin or capture.source)
+            seen = capture.second and replace(capture.second, sequence=sequence)
+            origin = settings.origin or capture.source
+            capture = replace(capture, sequence=sequence, source=origin, second=seen)
             comparison = store.compare_capture(capture, role)
             comparisons[capture.name] = comparison
             if comparison == "damaged":
@@ -197,7 +200,8 @@ def read_captures(
 
 def _merge_exposures(capture: NewCapture) -> NewCapture:
     """Return a capture in which each pixel comes from the longest exposure that did not clip it."""
-    return replace(capture, frames=capture.merged_frames(), exposures_ms=())
+    second = capture.second and _merge_exposures(capture.second)
+    return replace(capture, frames=capture.merged_frames(), exposures_ms=(), second=second)
 
 
 def find_captures(
@@ -230,7 +234,7 @@ def find_captures(
                 )
             size = assumed or chosen.projector
     try:
-        imports = chosen.read(source, prefix=prefix, projector=size, **options)
+        imports = pair_cameras(chosen.read(source, prefix=prefix, projector=size, **options))
     except InputError:
         if assumption:
             warn(assumption)  # it may be why
@@ -473,12 +477,12 @@ def import_opencv_calibration(
                 "replace it with --force (it goes to the session's trash)"
             )
         captures = store.captures(with_frames=True)
-        projectors = {capture.sequence.projector_size for capture in captures} - {None}
+        others = {capture.other_size for capture in captures} - {None}
         sizes = {
             device: _resolve_size(path, device, given, stated, captured)
             for device, given, captured in (
                 ("camera", camera, {capture.size for capture in captures}),
-                ("projector", projector, projectors),
+                ("projector", projector, others),
             )
         }
         camera_lens, projector_lens = (  # raises what a lens cannot have
@@ -541,9 +545,11 @@ def _is_confirmed(model: StereoModel, captures: Iterable[Capture], warn: Warn) -
     rig = model.rig
     for capture in captures:
         sequence = capture.sequence
-        is_same = (capture.size, sequence.projector_size) == (rig.camera.size, rig.projector.size)
+        is_same = (capture.size, capture.other_size) == (rig.camera.size, rig.projector.size)
         if is_same and len(sequence.axes) > 1:
-            check = check_phases(capture.name, decode_capture(capture), model)
+            check = check_phases(
+                capture.name, match_second(capture, decode_capture(capture)), model
+            )
             for message in check.warnings:
                 warn(message)
             if check.agreement is not None:

@@ -329,9 +329,7 @@ def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCap
     check_capture_sizes(store, names)
     depths = settings.depth_range or load_stereo(store).depth_range_mm
     for i, (shot, frames, phases) in enumerate(
-        decode_captures(
-            store, names, job.warn, check=settings.check, rig=load_stereo(store).rig
-        )
+        decode_captures(store, names, job.warn, check=settings.check, rig=load_stereo(store).rig)
     ):
         job.progress(i / len(names), f"measuring {shot.name}")
         # the axis is that of the first, so that all can be compared pixel by pixel

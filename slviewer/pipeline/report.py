@@ -468,6 +468,8 @@ def summarise_capture(capture: Capture) -> str:
         f"{'axis' if len(sequence.axes) == 1 else 'axes'} {' and '.join(sequence.axes)}, "
         f"{len(sequence.frames)} frames, {patterns}"
     )
+    if capture.second is not None:
+        line += ", second camera {}x{}".format(*capture.second.size)
     if capture.exposures_ms:
         line += f", exposures {', '.join(f'{exposure:g}' for exposure in capture.exposures_ms)} ms"
     return line + (", colour" if capture.meta.get("texture") else "")

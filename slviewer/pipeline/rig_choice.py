@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from itertools import cycle
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -50,6 +50,8 @@ length of its lens in camera px, what its camera is set to by default, and its t
 RigLike = Mapping[str, Any] | Path | str
 """A choice of devices, a TOML file that holds one, or the name of a preset."""
 FOLDER = "rigs"
+_PARTS = ("camera", "second", "projector")
+"""Devices of a choice; the second camera may be missing."""
 _LARGEST = {"settle_ms": 60_000, "focal_px": 1e6, "exposure_ms": 600_000, "gain": 1e6}
 
 
@@ -149,6 +151,8 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
                 part: _make_device(part, choice[part], page=pages and getattr(pages, part))
                 for part in ("camera", "projector")
             }
+            if "second" in choice:
+                devices["second"] = _make_device("camera", choice["second"])
             made = Rig(str(choice.get("name", "rig")), **devices)
         if isinstance(made, Reel):
             made = RigSetup(made.rig, reel=made)
@@ -220,16 +224,17 @@ def _simulated_setup(
     scale: float = 1.0,
     seed: int = 0,
     thing: Thing = "board",
+    cameras: Literal[1, 2] = 1,
 ) -> RigSetup:
     """Return the simulated rig of a preset, with a thing of `devices.world`, such as the board, in
-    view."""
+    view, and one camera or two."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     rig = letter(scale, seed)
     world = SimulatedWorld(rig, board)
     if thing != "board":
         world.place(thing)
-    return RigSetup(simulated_rig(world), world, rig.camera.focal_px[0] * scale)
+    return RigSetup(simulated_rig(world, cameras), world, rig.camera.focal_px[0] * scale)
 
 
 @dataclass(frozen=True)
@@ -328,21 +333,23 @@ def check_choice(choice: Choice, where: str) -> None:
         _check_device(choice, "turntable", where)
     if "driver" in choice:
         given = _options_of_rig(choice)
-        if {"camera", "projector"} & set(given):
+        if set(_PARTS) & set(given):
             raise InputError(
                 f"{where} names a driver of a whole rig and a camera or a projector: remove one of"
                 " both"
             )
         _check_options(given, "rig", where)
         return
-    unknown = sorted(set(choice) - {*COMMON_KEYS, "camera", "projector"})
+    unknown = sorted(set(choice) - {*COMMON_KEYS, *_PARTS})
     if unknown:
         raise InputError(
-            f"{where} has the unknown key {unknown[0]!r}: use camera, projector,"
+            f"{where} has the unknown key {unknown[0]!r}: use {', '.join(_PARTS)},"
             f" {', '.join(COMMON_KEYS)}"
         )
     for part in ("camera", "projector"):
         _check_device(choice, part, where)
+    if "second" in choice:
+        _check_device(choice, "second", where)
 
 
 def _check_device(choice: Choice, part: str, where: str) -> None:
@@ -352,7 +359,7 @@ def _check_device(choice: Choice, part: str, where: str) -> None:
     if not isinstance(device, Mapping) or "driver" not in device:
         rather = "" if part == "turntable" else ", or a driver of a rig"
         raise InputError(f'{where} names no {part}: add [{part}] with driver = "…"{rather}')
-    _check_options(device, part, f"{where}, {part}")
+    _check_options(device, "camera" if part == "second" else part, f"{where}, {part}")
 
 
 def _read_preset(name: str, path: Path) -> Preset:
@@ -409,7 +416,7 @@ def _check_type(stated: str, value: Any, kind: Any) -> None:
 def _driver_names(choice: Choice) -> list[str]:
     """Return the drivers of a choice: that of the whole rig, or those of camera and projector, and
     of a turntable."""
-    parts = [choice, *(choice.get(part, {}) for part in ("camera", "projector", "turntable"))]
+    parts = [choice, *(choice.get(part, {}) for part in (*_PARTS, "turntable"))]
     return [str(part["driver"]) for part in parts if "driver" in part]
 
 

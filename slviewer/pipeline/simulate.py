@@ -21,6 +21,7 @@ from slviewer.simulation.plans import letter_plan, objects, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene
+from slviewer.simulation.second_camera import second_camera
 from slviewer.simulation.truth import rig_record, scene_record
 from slviewer.simulation.turning import stone, turning
 from slviewer.target.board import Board
@@ -29,7 +30,7 @@ TARGET = "circles:21x16:9"
 TRUTH = "truth.json"
 """In the session's folder: read by nothing but what scores a result."""
 KINDS = ("pose", "plane", "sphere", "object", "turn")
-Preset = Literal["letter", "turn"]
+Preset = Literal["letter", "turn", "pair"]
 NOMINAL = "stone.ply"
 """Beside the truth: the surface of what turns, in its own frame, for comparing with."""
 MIN_POSES = 3
@@ -53,7 +54,7 @@ def simulate(
     Args:
         session: Session folder to make.
         preset: letter: planes, spheres and an object at three depths; turn: an object at three
-            depths, and another on a turntable.
+            depths, and another on a turntable; pair: as letter, seen by two cameras.
         scale: Resolution of the camera, as a share of 1600x1200 px; 0.25 is quick.
         poses: How many target poses.
         seed: Another seed is another rig of the same kind.
@@ -68,7 +69,8 @@ def simulate(
         raise InputError(f"{poses} target poses cannot be simulated: choose {MIN_POSES} to 200")
     board = Board.parse(TARGET)
     rig = letter(scale, seed)
-    plan = letter_plan(rig, board, poses) if preset == "letter" else turn_plan(rig, board, poses)
+    plan = turn_plan(rig, board, poses) if preset == "turn" else letter_plan(rig, board, poses)
+    second = second_camera(rig) if preset == "pair" else None
     both = p18(rig.projector.size)
     truth: dict[str, Any] = {
         "preset": preset,
@@ -76,20 +78,28 @@ def simulate(
         "seed": seed,
         "target": TARGET,
         "rig": rig_record(rig),
+        **({"second": rig_record(second.rig)} if second else {}),
     }
     numbers = {name: i for i, name in enumerate(plan)}
 
     def rendered(names: list[str], sequence: PatternSequence) -> Iterator[NewCapture]:
         """One capture after another; the next one is rendered while one is saved."""
 
-        def render(name: str) -> np.ndarray:
-            """Return the frames (n, h, w) of a capture."""
-            return Renderer(rig, plan[name]).capture(sequence, numbers[name])
-
         source = f"simulated: {preset}, scale {scale:g}, seed {seed}"
-        for name, frames in compute_ahead(render, names):
+
+        def render(name: str) -> NewCapture:
+            """Return a capture."""
+            scene, number = plan[name], numbers[name]
+            seen = None
+            if second is not None:
+                frames = second.capture(scene, sequence, number)
+                seen = NewCapture(name, sequence, frames, None, source)
+            frames = Renderer(rig, scene).capture(sequence, number)
+            return NewCapture(name, sequence, frames, None, source, second=seen)
+
+        for name, capture in compute_ahead(render, names):
             progress(numbers[name] / len(plan), f"rendering {name}")
-            yield NewCapture(name, sequence, frames.result(), None, source)
+            yield capture.result()
 
     with Session.create(session) as store:
         groups = {kind: [n for n in plan if n.startswith(f"{kind}_")] for kind in KINDS}

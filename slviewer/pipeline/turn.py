@@ -143,7 +143,7 @@ def turn(settings: TurnSettings) -> Turn:
         if (stereo := load_stereo_if_complete(store)) is not None:
             sequence = one_axis(sequence, depth_axis(stereo.rig))  # half of the frames
         frames = len(sequence.frames) * max(1, len(exposures)) * len(todo)
-        check_space(store, bench.rig.camera, frames, "the turn")
+        check_space(store, bench.rig.cameras, frames, "the turn")
         with bench.rig.opened() as devices:
             set_camera(devices, choice, settings)
 

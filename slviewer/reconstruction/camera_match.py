@@ -230,6 +230,6 @@ def _walk(numbers, sigma_1, sigma_2, a, b, j, i):
             su = math.sqrt(qy * qy * vp + py * py * vq) / abs(turn)
             sv = math.sqrt(px * px * vq + qx * qx * vp) / abs(turn)
             return i + du, j + dv, su, sv
-        j += int(round(min(max(dv, -FARTHEST_PX), FARTHEST_PX)))
-        i += int(round(min(max(du, -FARTHEST_PX), FARTHEST_PX)))
+        j += round(min(max(dv, -FARTHEST_PX), FARTHEST_PX))
+        i += round(min(max(du, -FARTHEST_PX), FARTHEST_PX))
     return NOWHERE

@@ -155,15 +155,16 @@ class Acquisition(Service):
     """Owns the devices and the queue of requests. Every method may be called from any thread, and
     returns at once.
 
-    `offer(frame, full_scale)` gets every preview (h, w), a fresh array each, and what the camera
-    states as its full scale; it must return at once too. `clock()` returns the time in s.
+    `offer(frame, full_scale, second)` gets every preview (h, w), a fresh array each, what the
+    camera states as its full scale, and the second camera's frame or None; it must return at once
+    too. `clock()` returns the time in s.
     """
 
     def __init__(
         self,
         notices: Notices,
         changed: Callable[[], None],
-        offer: Callable[[np.ndarray, int | None], None],
+        offer: Callable[..., None],
         timing: Timing,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -423,6 +424,8 @@ class Acquisition(Service):
             settings = self._settings
         if self._applied is None or settings != self._applied:
             actual = rig.camera.settings() if settings is None else rig.camera.apply(settings)
+            if rig.second is not None:
+                rig.second.apply(actual)
             self._applied = settings or actual
             with self._condition:
                 # another thread may have set it meanwhile
@@ -439,7 +442,11 @@ class Acquisition(Service):
         width, height = rig.camera.size
         frame = np.empty((height, width), rig.camera.dtype)
         rig.camera.grab(frame)
-        self._offer(frame, stated_full_scale(rig.camera))
+        second = None
+        if rig.second is not None:
+            second = np.empty(rig.second.size[::-1], rig.second.dtype)
+            rig.second.grab(second)
+        self._offer(frame, stated_full_scale(rig.camera), second)
 
     def _serve_stream(self, rig: Rig, stream: Stream) -> None:
         """Capture a stream's sequence once, and show its white frame as preview. Aborted once
@@ -461,7 +468,7 @@ class Acquisition(Service):
             return
         if white is not None and self._clock() >= self._next_preview:
             self._next_preview = self._clock() + 1 / STREAM_PREVIEWS_PER_S
-            self._offer(white, stated_full_scale(rig.camera))
+            self._offer(white, stated_full_scale(rig.camera), None)
 
     def _serve_request(self, rig: Rig, task: _Task) -> None:
         """Execute a queued task and report how it ended; a DeviceError is raised to the caller."""

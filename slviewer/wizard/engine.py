@@ -395,8 +395,8 @@ class Engine:
         try:
             if changed:
                 session = reader.read(rig, bench.focal_px if bench else None)
-            camera = bench.rig.camera if bench and rig.camera is not None else None
-            space = measure_space(reader.session, camera, reader.count_frames(rig))
+            cameras = bench.rig.cameras if bench and rig.camera is not None else ()
+            space = measure_space(reader.session, cameras, reader.count_frames(rig))
         except Exception as error:  # most likely files were being changed
             failure = failure or describe_failure("Reading the session", error)
         return session, space, failure

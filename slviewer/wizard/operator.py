@@ -290,7 +290,7 @@ class Operator(RigRequests, ResultRequests):
 
     def _check_space(self, name: str, frames: int) -> None:
         """Raise SessionError where the disk has no room for so many frames."""
-        check_space(self._store, self._require_bench().rig.camera, frames, name)
+        check_space(self._store, self._require_bench().rig.cameras, frames, name)
 
     def _next_name(self, kind: str) -> str:
         """Return the next unused name, such as pose_07, counting saved, queued and deleted

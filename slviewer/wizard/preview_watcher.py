@@ -58,24 +58,29 @@ class Watcher:
         self._detector = LatestWorker("slviewer board detection", self._detect, _REST)
         self._viewer = LatestWorker("slviewer preview", self._make_preview)
 
-    def offer(self, frame: np.ndarray, full_scale: int | None = None) -> None:
+    def offer(
+        self,
+        frame: np.ndarray,
+        full_scale: int | None = None,
+        second: np.ndarray | None = None,
+    ) -> None:
         """Analyse `frame` (h, w) next, instead of any that is still waiting; `full_scale` is what
-        the camera states."""
-        self._viewer.offer((frame, full_scale))
+        the camera states, `second` a second camera's frame, to be shown with it."""
+        self._viewer.offer((frame, full_scale, second))
 
     def close(self) -> None:
         """End both threads."""
         self._viewer.close()
         self._detector.close()
 
-    def _make_preview(self, item: tuple[np.ndarray, int | None]) -> None:
+    def _make_preview(self, item: tuple[np.ndarray, int | None, np.ndarray | None]) -> None:
         """Reduce a frame (h, w), offer it for board detection, and publish a preview with the
         latest detection.
 
-        ``item``: the frame, and the full scale that the camera states.
+        ``item``: as of `offer`.
         """
         now = time.monotonic()
-        frame, full_scale = item
+        frame, full_scale, second = item
         image, scale = reduced(frame, full_scale=full_scale)
         white = image_white(frame, full_scale)
         if self.watch.board:
@@ -91,7 +96,9 @@ class Watcher:
         light = brightness(frame, white)
         level = to_eight_bits(np.array([[white]], frame.dtype), full_scale, int(frame.max()))
         image = np.where(image < level, image, np.uint8(255))
-        self._analysed(PreviewView(self._number, image, scale, *light, board, missing, None, rate))
+        beside = None if second is None else reduced(second, full_scale=full_scale)[0]
+        shown = self._number, image, scale, *light, board, missing, None, rate
+        self._analysed(PreviewView(*shown, second=beside))
 
     def _detect(self, item: tuple[np.ndarray, float, float]) -> None:
         """Detect the board in (reduced image, its scale, time in s), and store it, or why there is

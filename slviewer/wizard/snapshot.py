@@ -422,7 +422,8 @@ class PreviewView:
 
     `image` (h, w) uint8 is `scale` times the camera's size. `histogram` (64,) are shares of the
     pixels by grey level. `board` is None where none is detected, and `missing` is then the reason.
-    `countdown_s`: seconds until a hands-free capture, None where none is coming.
+    `countdown_s`: seconds until a hands-free capture, None where none is coming. `second`: what a
+    second camera sees, None where there is none.
     """
 
     number: int
@@ -435,6 +436,7 @@ class PreviewView:
     missing: str
     countdown_s: float | None
     frames_per_s: float
+    second: np.ndarray | None = None
 
     @property
     def brightness(self) -> Brightness:

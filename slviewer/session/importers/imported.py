@@ -31,10 +31,19 @@ class ImportableRecording:
     settings: Mapping[str, Any] = field(default_factory=dict)
     channel: Channel | None = None  # of colour frames; None: the default
     exposures_ms: tuple[float, ...] = ()
+    second: "ImportableRecording | None" = None  # of a second camera
 
     def read(self) -> NewCapture:
         """The capture with its frames; InputError where an image cannot be used.
         `settings["channel"]` states which channel of colour frames was taken."""
+        capture = self._read_own()
+        if self.second is None:
+            return capture
+        second = replace(self.second._read_own(), sequence=capture.sequence, texture=None)
+        return replace(capture, second=second)
+
+    def _read_own(self) -> NewCapture:
+        """The capture without what a second camera saw."""
         channel = self.channel or DEFAULT_CHANNEL
         kinds = [frame.kind for frame in self.sequence.frames]
         # the frame that shows the scene's colours, in the middle one of several exposures
@@ -285,6 +294,52 @@ def collect_captures(
         if names.count(name) > 1:
             raise InputError(f"several folders of {source} would be called {name}: rename one")
     return Imports(recordings, warnings, skipped)
+
+
+_CAMERAS = tuple(
+    (re.compile(rf"(?<![a-zA-Z]){first}(?![a-zA-Z0-9])", re.IGNORECASE), second)
+    for first, second in (("left", "right"), ("l", "r"), ("cam0", "cam1"), ("camera0", "camera1"))
+)
+"""How names of files and folders say which of two cameras they are of."""
+
+
+def pair_cameras(imports: Imports) -> Imports:
+    """Join the captures of two cameras, if that is what all captures of a source are: those of the
+    first have a name with left, L, cam0 or camera0 in it, of the folder or of every file, and each
+    of their files has a namesake with right, R, cam1 or camera1."""
+    every = {file for recording in imports.recordings for file in recording.files}
+    pairs, of_second = list[ImportableRecording](), set[Path]()
+    for recording in imports.recordings:
+        for is_first, second in _CAMERAS:
+            files = [_name_alike(file, is_first, second) for file in recording.files]
+            if not files or not all(file.is_file() for file in files):
+                continue
+            name = is_first.sub("", recording.name).strip("_- ") or recording.source.parent.name
+            other = replace(recording, files=tuple(files), source=files[0].parent)
+            pairs.append(replace(recording, name=plain_name(name, "capture"), second=other))
+            of_second.update(files)
+            break
+    own = {file for pair in pairs for file in pair.files}
+    if not pairs or every - own - of_second:
+        return imports
+    text = f"{join_names([pair.name for pair in pairs], 3)}: taken by two cameras, by their names"
+    told = [each for each in imports.warnings if not any(f.name in each for f in of_second)]
+    return replace(imports, recordings=pairs, warnings=[*told, text])
+
+
+def _name_alike(file: Path, is_first: re.Pattern[str], second: str) -> Path:
+    """Return where the second camera's image of a file of the first would be: the last of file and
+    folder that names a camera names the other one. A file without a camera's name is its own."""
+    for part in (file, file.parent):
+        found = is_first.search(part.name)
+        if found:
+            written = second.upper() if found[0].isupper() else second
+            written = written.capitalize() if found[0].istitle() and len(second) > 1 else written
+            name = part.name[: found.start()] + written + part.name[found.end() :]
+            return part.with_name(name) / file.relative_to(part) if part != file else (
+                file.with_name(name)
+            )
+    return file.parent / ""
 
 
 def none_usable(skipped: Sequence[Skipped]) -> InputError:

@@ -36,6 +36,7 @@ _TRANSFORMS = (
     ("roration", "translation"),  # procam-calibration, as it spells it
     ("rotation", "translation"),
     ("rot", "trans"),
+    ("Rlr", "Tlr"),  # SLMaster
 )
 """Common names, in the order of `ENTRIES`; a file is taken to use one row of each."""
 _SIZES = {
@@ -63,8 +64,12 @@ def read_matrices(storage: Storage, keys: Sequence[str] | None = None) -> dict[s
         raise InputError(
             f"{storage.name} has no {', '.join(missing)}: its keys are {_list_keys(storage)}"
         )
+    matrices = {entry: storage.matrix(key) for entry, key in zip(ENTRIES, keys, strict=True)}
+    if matrices["R"].shape == (3, 4) and {"R1", "R2"} <= set(storage.entries):
+        # SLMaster writes P2 in its place; both rectifying rotations contain it
+        matrices["R"] = storage.matrix("R2").T @ storage.matrix("R1")
     return {
-        entry: _CHECKS[entry[0]](storage.matrix(key), f"{storage.name}: {key}")
+        entry: _CHECKS[entry[0]](matrices[entry], f"{storage.name}: {key}")
         for entry, key in zip(ENTRIES, keys, strict=True)
     }
 
