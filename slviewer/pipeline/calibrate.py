@@ -62,6 +62,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
 
 SmoothingKind = Literal["spline", "polynomial"]
+_OF_PAIR = {"projector's": "second camera's", "projector": "second camera"}
 LENS = "lens/camera"
 """The session's copy of the camera's calibration that a file stated."""
 
@@ -182,9 +183,13 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
         part(job.progress, 0, 0.65),
         camera,
     )
+    if first.second is not None:  # which takes the projector's place
+        diagnosed = replace(diagnosed, verdict=diagnosed.verdict.rename(_OF_PAIR))
     if diagnosed.stereo is None:
         save_verdict(store, diagnosed.verdict, names)
     result = _fit_models(diagnosed, settings, part(job.progress, 0.66, 0.97), job.warn, excluded)
+    if first.second is not None:
+        result = replace(result, verdict=result.verdict.rename(_OF_PAIR))
     job.progress(0.97, "saving")
     inputs = store.input_hashes(*result.stereo.poses, *([LENS] if camera else []))
     used = replace(settings, camera=LENS if camera else None)  # the session's own copy
@@ -198,7 +203,8 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
             trash_models(store, [name for name in available_models(store) if name not in made])
         for model in result.models:
             verdict = result.verdict if model is result.stereo else None
-            yield replace(describe_model(model, verdict, inputs), settings=used)
+            record = describe_model(model, verdict, inputs)
+            yield replace(record, settings=used, second_camera=first.second is not None)
             save_compiled(store, model)
         save_verdict(store, result.verdict, names)
     if result.is_rejected:

@@ -299,7 +299,8 @@ class ModelCalibration(Record, frozen=True, kw_only=True):
     """Each model, and how well it fits the target poses that it was made from.
 
     ``model``: its parameters, as the model's ``to_dict`` returns them; ``verdict``: of the stereo
-    model, on all. ``fit`` is None for other models than stereo that version 0.2 made.
+    model, on all; ``second_camera``: whether a second camera was calibrated in the projector's
+    place. ``fit`` is None for other models than stereo that version 0.2 made.
 
     Arrays: of stereo ``residuals_<pose>`` (n, 4) px, of the others what their ``to_arrays``
     returns.
@@ -311,6 +312,7 @@ class ModelCalibration(Record, frozen=True, kw_only=True):
     model: dict[str, Any] = {}
     fit: StereoFit | PixelwiseFit | SplinedFit | None = None
     verdict: Verdict | None = None
+    second_camera: bool = False
 
     @classmethod
     def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -365,7 +367,8 @@ class ModelCalibration(Record, frozen=True, kw_only=True):
             if self.verdict is None
             else [f"{line.strip()}." for line in self.verdict.text().splitlines()]
         )
-        return replace(of_fit, notes=[*of_fit.notes, *verdict])
+        pair = ["Two cameras: the second one takes the projector's place."] * self.second_camera
+        return replace(of_fit, notes=[*pair, *of_fit.notes, *verdict])
 
 
 def _describe_imported(matrices: Mapping[str, Any]) -> dict[str, Any]:

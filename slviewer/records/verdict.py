@@ -1,8 +1,8 @@
 """Findings on a capture or a calibration, with causes and remedies; the examination of a capture's
 frames; and the verdict on a calibration: good, doubtful or rejected."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import msgspec
@@ -91,6 +91,22 @@ class Verdict(msgspec.Struct, frozen=True):
             findings, key=lambda f: (-severities.index(f.severity), CAUSES.index(f.cause))
         )
         return cls(tuple(ranked))
+
+    def rename(self, words: Mapping[str, str]) -> "Verdict":
+        """Return the verdict with other words for devices in its sentences and remedies."""
+
+        def renamed(text: str) -> str:
+            """Return a text with the words replaced."""
+            for word, other in words.items():
+                text = text.replace(word, other)
+            return text
+
+        return Verdict(
+            tuple(
+                replace(each, sentence=renamed(each.sentence), remedy=renamed(each.remedy))
+                for each in self.findings
+            )
+        )
 
     @property
     def causes(self) -> tuple[Cause, ...]:

@@ -24,6 +24,11 @@ class SecondCamera:
     R: np.ndarray
     t: np.ndarray
 
+    def pair(self, rig: SimulatedRig) -> SimulatedRig:
+        """Return the first camera's ``rig`` with this camera in the projector's place, as it is
+        calibrated."""
+        return replace(rig, projector=self.rig.camera, R=self.R, t=self.t)
+
     def view(self, scene: Scene) -> Scene:
         """Return a scene of the first camera's frame in the second's."""
         pose = pose_of(scene)

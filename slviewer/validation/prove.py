@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.validation.proof import Proof
 from slviewer.validation.prove_accuracy import prove_accuracy, prove_uncertainty
+from slviewer.validation.prove_cameras import prove_cameras
 from slviewer.validation.prove_captures import prove_captures
 from slviewer.validation.prove_causes import prove_causes
 from slviewer.validation.prove_guidance import prove_guidance
@@ -18,6 +19,7 @@ from slviewer.validation.prove_surfaces import prove_edges, prove_surfaces
 
 Claim = Literal[
     "accuracy",
+    "cameras",
     "causes",
     "edges",
     "guidance",
@@ -46,6 +48,7 @@ def prove_named_faults(scale: float, *, seed: int, progress: Progress) -> Proof:
 
 CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "accuracy": ("accuracy at the noise floor", prove_accuracy),
+    "cameras": ("two cameras", prove_cameras),
     "causes": ("faults called by their names", prove_named_faults),
     "edges": ("printed edges without ridges", prove_edges),
     "guidance": ("guided poses", prove_guidance),
