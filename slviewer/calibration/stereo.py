@@ -137,6 +137,10 @@ class StereoModel:
             projector_pixels
         )
 
+    def device_rays(self) -> tuple[Floats, Floats]:
+        """Undistorted normalised coordinates (h, w, 2) of each pixel of both devices."""
+        return self.rig.camera.rays(), self.rig.projector.rays()
+
     def points(self, phase: PhaseMap) -> Floats32:
         """Triangulate the absolute phase of one axis (eq. 6-8, with exact inversion of the
         projector's distortion).

@@ -52,6 +52,7 @@ from slviewer.pipeline.models import (
     available_models,
     check_accepted,
     load_model,
+    load_pair,
     load_stereo,
     preferred_model,
     warn_if_frame_changed,
@@ -260,7 +261,7 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     look = look_at_capture(shot)
     frames, decoded = look.stack, decode_capture(shot, look)
     check_capture(capture, shot.sequence, frames, decoded, files=shot.files)
-    phases = match_second(shot, decoded, stereo.rig)
+    phases = match_second(shot, decoded, load_pair(store))
     check_sizes(capture, shot.size, shot.other_size, stereo.rig)
     board = Board.parse(stereo.board)
     detection = detect(board, capture_texture(shot, frames))

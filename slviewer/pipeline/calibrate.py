@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import msgspec
 import numpy as np
 
 from slviewer import __version__
@@ -203,8 +204,9 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
             trash_models(store, [name for name in available_models(store) if name not in made])
         for model in result.models:
             verdict = result.verdict if model is result.stereo else None
-            record = describe_model(model, verdict, inputs)
-            yield replace(record, settings=used, second_camera=first.second is not None)
+            found = describe_model(model, verdict, inputs)
+            record = msgspec.structs.replace(found.record, second_camera=first.second is not None)
+            yield replace(found, record=record, settings=used)
             save_compiled(store, model)
         save_verdict(store, result.verdict, names)
     if result.is_rejected:

@@ -20,11 +20,11 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.examination import examine_frames, load_examination, load_or_save_examination
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.models import load_pair
 from slviewer.pipeline.stored_records import SessionLike, opened
-from slviewer.reconstruction.camera_match import match_cameras
+from slviewer.reconstruction.camera_match import PairCalibration, match_cameras
 from slviewer.records.verdict import Examination
 from slviewer.report.maps import REASON_LABELS, phase_maps, reason_shares
 from slviewer.session.atomic import to_json
@@ -80,17 +80,17 @@ def decode_capture(
 
 
 def match_second(
-    capture: Capture, phases: dict[Axis, PhaseMap], rig: StereoRig | None = None
+    capture: Capture, phases: dict[Axis, PhaseMap], calibration: PairCalibration | None = None
 ) -> dict[Axis, PhaseMap]:
     """Return what a capture is reconstructed from: its decoded ``phases``, or, where two cameras
     saw it, the coordinates of the second one, as `match_cameras` does.
 
     Raises InputError for phases that are not absolute, and for patterns along one axis unless the
-    cameras' ``rig`` is known.
+    cameras' ``calibration`` is known.
     """
     if capture.second is None:
         return phases
-    return match_cameras(phases, decode_capture(capture.second), rig)
+    return match_cameras(phases, decode_capture(capture.second), calibration)
 
 
 def decode_frames(
@@ -271,15 +271,15 @@ def decode_captures(
     *,
     relative: bool = False,
     check: bool = True,
-    rig: StereoRig | None = None,
+    matched: bool = True,
 ) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
     """Captures with their frames and phases, in order; the next one's frames are read while one is
     processed.
 
     ``warn`` is called with frames that contradict the others, and with the reasons why many pixels
     are masked; ``relative`` as in `decode_capture`. ``check``: compare the frames of captures that
-    have no saved comparison. ``rig``: the calibration by which what two cameras saw is matched, as
-    in `match_second`; without one the phases are those of the projector.
+    have no saved comparison. ``matched``: what two cameras saw is matched by the session's
+    calibration, as in `match_second`; else the phases are those of the projector.
     """
     captures = [session.load_capture(name) for name in names]
     for capture, looking in compute_ahead(look_at_capture, captures):
@@ -294,7 +294,9 @@ def decode_captures(
             messages = compared.warnings() if compared else []
             for message in [*messages, *loss_warnings(capture.sequence, frames, phases)]:
                 warn(f"{capture.name}: {message}")
-        yield capture, frames, match_second(capture, phases, rig) if rig else phases
+        if matched and capture.second is not None:
+            phases = match_second(capture, phases, load_pair(session))
+        yield capture, frames, phases
 
 
 def look_at_capture(capture: Capture) -> Look:
@@ -447,7 +449,7 @@ def write_decoded(
     folder, files = Path(out), dict[str, str]()
     with opened(session) as store:
         progress(0.1, "decoding")
-        _, _, phases = next(decode_captures(store, [capture], warn, relative=True))
+        _, _, phases = next(decode_captures(store, [capture], warn, relative=True, matched=False))
     progress(0.6, "writing")
     folder.mkdir(parents=True, exist_ok=True)
     for axis, phase in phases.items():

@@ -194,6 +194,12 @@ def load_calibration(
         return load_model(store, model)
 
 
+def load_pair(store: Session) -> StereoModel | SplinedModel:
+    """Load the calibration by which two cameras are matched: splined, else stereo."""
+    model = load_model(store, "splined") if "splined" in available_models(store) else None
+    return model if isinstance(model, SplinedModel) else load_stereo(store)
+
+
 def load_stereo_if_complete(store: Session) -> StereoModel | None:
     """Load the session's stereo calibration; None where there is none, or an imported one without
     sizes."""

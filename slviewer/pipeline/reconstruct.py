@@ -128,9 +128,7 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
     check_capture_sizes(store, [capture])
     job.progress(0.1, "reading and decoding")
     shot, frames, decoded = next(
-        decode_captures(
-            store, [capture], warn, relative=True, check=settings.check, rig=load_stereo(store).rig
-        )
+        decode_captures(store, [capture], warn, relative=True, check=settings.check)
     )
     phases = absolute_phases(store, capture, decoded, settings.depth_range, warn)
     is_pose = shot.role == "calibration"
@@ -329,7 +327,7 @@ def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCap
     check_capture_sizes(store, names)
     depths = settings.depth_range or load_stereo(store).depth_range_mm
     for i, (shot, frames, phases) in enumerate(
-        decode_captures(store, names, job.warn, check=settings.check, rig=load_stereo(store).rig)
+        decode_captures(store, names, job.warn, check=settings.check)
     ):
         job.progress(i / len(names), f"measuring {shot.name}")
         # the axis is that of the first, so that all can be compared pixel by pixel
@@ -480,8 +478,7 @@ def reconstruct_captures(
     """
     store = job.store
     check_capture_sizes(store, names)
-    warn, rig = job.warn if examine else ignore_warnings, load_stereo(store).rig
-    decoded = decode_captures(store, names, warn, rig=rig)
+    decoded = decode_captures(store, names, job.warn if examine else ignore_warnings)
     for i, (capture, frames, phases) in enumerate(decoded):
         job.progress(i / len(names), f"{doing} {capture.name}")
         texture = capture_texture(capture, frames, stretch=False)

@@ -14,6 +14,7 @@ calibrated pair has.
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -43,18 +44,30 @@ FARTHEST_PX = 16.0
 NOWHERE = (math.nan,) * 4
 
 
+class PairCalibration(Protocol):
+    """A calibration of two cameras, the second in the projector's place. ``pinholes``: their lenses
+    and arrangement."""
+
+    @property
+    def pinholes(self) -> StereoRig:
+        """Both lenses by their best pinhole and Brown models, and their arrangement."""
+
+    def device_rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Undistorted normalised coordinates (h, w, 2) of each pixel of both cameras."""
+
+
 def match_cameras(
     first: Mapping[Axis, PhaseMap],
     second: Mapping[Axis, PhaseMap],
-    rig: StereoRig | None = None,
+    calibration: PairCalibration | None = None,
 ) -> dict[Axis, PhaseMap]:
     """Return, by axis, the pixel coordinates of the second camera that see what the pixels of the
     first see, as phase maps (h, w) of the first: along x its columns, along y its rows.
 
-    ``first``, ``second``: the absolute phases that each camera decoded. ``rig``: the calibrated
-    cameras, the second as its projector, needed where the patterns have one axis; the result then
-    has the axis along which the cameras are apart. Sigma is that of both cameras' phases. Masked as
-    `Reason.UNSEEN` where the second camera sees no such point, or an edge.
+    ``first``, ``second``: the absolute phases that each camera decoded. ``calibration``: of the
+    cameras, the second in the projector's place, needed where the patterns have one axis; the
+    result then has the axis along which the cameras are apart. Sigma is that of both cameras'
+    phases. Masked as `Reason.UNSEEN` where the second camera sees no such point, or an edge.
 
     Raises InputError for one axis without a calibration.
     """
@@ -65,16 +78,17 @@ def match_cameras(
     sigmas = [[np.hypot(phase.sigma_px, error) for phase, error in each] for each in (known, seen)]
     kept = axes
     if len(axes) == 1:
-        if rig is None:
+        if calibration is None:
             raise InputError(
                 "Cannot match the two cameras: their patterns have one axis, and no calibration of"
                 " the cameras gives the other. Calibrate with patterns along both axes, or import a"
                 " calibration."
             )
-        for maps, errors, rows in zip(numbers, sigmas, rectified_rows(rig), strict=True):
+        for maps, errors, rows in zip(numbers, sigmas, rectified_rows(calibration), strict=True):
             maps.append(rows)
             errors.append(np.zeros_like(rows))
-        kept = ["x" if abs(rig.t[0]) >= abs(rig.t[1]) else "y"]
+        apart = np.abs(calibration.pinholes.t)
+        kept = ["x" if apart[0] >= apart[1] else "y"]
     found = _find(*(np.stack(maps, axis=-1, dtype=np.float64) for maps in (*numbers, *sigmas)))
     base = known[0][0]
     reason = base.reason.copy()
@@ -97,9 +111,10 @@ def match_cameras(
     return matched
 
 
-def rectified_rows(rig: StereoRig) -> tuple[np.ndarray, np.ndarray]:
+def rectified_rows(calibration: PairCalibration) -> tuple[np.ndarray, np.ndarray]:
     """Return the row (h, w) px of each pixel of both cameras in the rectified pair: equal where
     both can see the same point."""
+    rig = calibration.pinholes
     across = -rig.R.T @ rig.t  # from the first camera's centre to the second's
     across /= np.linalg.norm(across)
     along = np.array([0.0, 0.0, 1.0]) + rig.R.T @ [0.0, 0.0, 1.0]  # between both optical axes
@@ -113,7 +128,8 @@ def rectified_rows(rig: StereoRig) -> tuple[np.ndarray, np.ndarray]:
         x, z = (rays @ each[:2] + each[2] for each in to_frame)
         return np.ascontiguousarray(focal * x / z)
 
-    return rows(rig.camera.rays(), frame), rows(rig.projector.rays(), frame @ rig.R.T)
+    first, second = calibration.device_rays()
+    return rows(first, frame), rows(second, frame @ rig.R.T)
 
 
 def _find(

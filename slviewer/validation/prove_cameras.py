@@ -1,23 +1,27 @@
-"""Whether two cameras measure at their noise floor, and whatever the projector between them does."""
+"""Whether two cameras measure at their noise floor, whatever the projector between them does."""
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from statistics import fmean
+from typing import Any
+
+import numpy as np
 
 from slviewer.calibration.observe import observe
 from slviewer.evaluation.fit import Comparison
 from slviewer.fringe.decode import texture
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import PatternSequence
-from slviewer.geometry.rig import StereoRig
+from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.camera_match import match_cameras
 from slviewer.reconstruction.reconstruct import Model
+from slviewer.records.verification import Shape
 from slviewer.simulation.plans import letter_plan, rotation
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
@@ -51,7 +55,7 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
     rig = letter(scale, seed)
     second = second_camera(rig)
     plan = letter_plan(rig, poses=POSES)
-    turn = rotation((0.0, TURN_RAD, 0.0))
+    turn = rotation(np.array([0.0, TURN_RAD, 0.0]))
     turned = replace(rig, R=turn @ rig.R, t=turn @ rig.t)
     pair = second.pair(rig)
     both = p18(rig.projector.size)
@@ -71,7 +75,7 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
     def scan_pair(actual: SimulatedRig, scene: Scene, number: int) -> PhaseMap:
         """Return the second camera's columns, as scanned with a rig."""
         seen = seen_by_both(actual, second, scene, scan_sequence(rig), number)
-        return match_cameras(*seen, StereoRig(*vars(own[0].rig).values()))["x"]
+        return match_cameras(*seen, own[1])["x"]
 
     def scan_alone(actual: SimulatedRig, scene: Scene, number: int) -> PhaseMap:
         """Return the projector's columns, as scanned with a rig."""
@@ -79,7 +83,7 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
         frames = Renderer(actual, scene).capture(sequence, number)
         return decode_frames("scan", sequence, frames)["x"]
 
-    cases: Mapping[str, tuple[SimulatedRig, tuple, Scan, SimulatedRig]] = {
+    cases: dict[str, tuple[SimulatedRig, Any, Scan, SimulatedRig]] = {
         "two cameras": (pair, own, scan_pair, rig),
         "two cameras, projector turned": (pair, own, scan_pair, turned),
         "one camera": (rig, alone, scan_alone, rig),
@@ -90,7 +94,7 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
         progress, cases, 0.6, 1.0
     ):
         models = {"stereo": stereo, "splined": splined, FLOOR: PerfectModel(true)}
-        row = measure(models, covered_pixels(seen), plan, lambda *s: scan(actual, *s), report)
+        row = measure(models, covered_pixels(seen), plan, partial(scan, actual), report)
         rows.append({"rig": name, **row})
         ratio, spacing = row["splined / floor"], row["worst spacing mm"]
         if name != "one camera, projector turned":
@@ -105,7 +109,7 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
 
 def seen_by_both(
     rig: SimulatedRig, second: SecondCamera, scene: Scene, sequence: PatternSequence, number: int
-) -> tuple[dict, dict]:
+) -> tuple[dict[Axis, PhaseMap], dict[Axis, PhaseMap]]:
     """Return the phases that both cameras decode of a scene, its projector as in ``rig``."""
     to_second = rig.R @ second.R.T
     moved = replace(second.rig, R=to_second, t=rig.t - to_second @ second.t)
@@ -118,7 +122,7 @@ def seen_by_both(
 
 def measure(
     models: Mapping[str, Model],
-    covered,
+    covered: np.ndarray,
     plan: Mapping[str, Scene],
     scan: Callable[[Scene, int], PhaseMap],
     progress: Progress,
@@ -127,7 +131,7 @@ def measure(
     shapes = {key: scene for key, scene in plan.items() if key.startswith(("plane_", "sphere_"))}
     planes, centres = list[Comparison](), dict[str, tuple[Spheres, Comparison]]()
     for key, scene, _ in track(progress, shapes):
-        shape = "sphere" if isinstance(scene, Spheres) else "plane"
+        shape: Shape = "sphere" if isinstance(scene, Spheres) else "plane"
         found, _ = compare_fits(models, scan(scene, [*plan].index(key)), covered, shape)
         if isinstance(scene, Spheres):
             centres[key] = scene, found

@@ -34,6 +34,7 @@ from slviewer.calibration.splined.unknowns import (
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Mask
 from slviewer.geometry.triangulation import check_map
@@ -106,6 +107,13 @@ class SplinedModel:
         rays = undistort(camera, pixels), undistort(device, projector)
         rays[0][unknown] = rays[1][unknown] = np.nan
         return rays
+
+    def device_rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Undistorted normalised coordinates (h, w, 2) of each pixel of both devices."""
+        width, height = (int(n) for n in self.rig.projector.size)
+        pixels = grid_points(np.arange(width), np.arange(height))
+        seen = undistort(self.rig.projector, pixels).reshape(height, width, 2)
+        return np.moveaxis(self.rays, 0, 2), seen
 
     @cached_property
     def rays(self) -> np.ndarray:

@@ -336,8 +336,10 @@ def _name_alike(file: Path, is_first: re.Pattern[str], second: str) -> Path:
             written = second.upper() if found[0].isupper() else second
             written = written.capitalize() if found[0].istitle() and len(second) > 1 else written
             name = part.name[: found.start()] + written + part.name[found.end() :]
-            return part.with_name(name) / file.relative_to(part) if part != file else (
-                file.with_name(name)
+            return (
+                part.with_name(name) / file.relative_to(part)
+                if part != file
+                else (file.with_name(name))
             )
     return file.parent / ""
 
