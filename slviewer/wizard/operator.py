@@ -313,6 +313,11 @@ class Operator(RigRequests, ResultRequests):
             raise InputError(
                 "a recording holds only its own patterns: choose a real rig or the simulated one"
             )
+        if bench.rig.second is not None:
+            raise InputError(
+                "Cannot scan live: it takes one camera and its projector, and this rig has two"
+                " cameras. Capture scans one by one."
+            )
         axis = depth_axis(calibration.stereo.rig)
         sequence = replace(short(bench.rig.projector.size, axis), levels=self._reader.levels())
         live = LiveScan(

@@ -1,0 +1,105 @@
+"""Two cameras from the terminal: simulated, calibrated, scanned and merged; and a recorded pair."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.cli import main
+from slviewer.devices.capture import capture_frames, capture_with_texture
+from slviewer.fringe.presets import gray
+from slviewer.pipeline.capture import capture
+from slviewer.pipeline.capture_phases import decode_capture, match_second
+from slviewer.pipeline.models import load_calibration, load_pair
+from slviewer.pipeline.rig_choice import set_up
+from slviewer.pipeline.stored_records import load_record
+from slviewer.records.calibration import ModelCalibration
+from slviewer.records.verification import Verification
+from slviewer.session.store import Session
+from slviewer.simulation.plans import spheres
+
+pytestmark = pytest.mark.computes
+TWO = {"driver": "simulated", "scale": 0.1, "cameras": 2}
+
+
+def test_both_cameras_are_captured_in_every_exposure(tmp_path: Path) -> None:
+    with set_up(TWO, None).rig.opened() as rig:
+        sequence = gray(rig.projector.size)
+        captured = capture_with_texture(rig, sequence, (0.5, 1.0))
+        assert captured.second is not None
+        assert (
+            captured.second.shape == captured.frames.shape == (2 * len(sequence.frames), 120, 160)
+        )
+        single = np.zeros((len(sequence.frames), 120, 160), np.uint8)
+        first = capture_frames(rig, sequence, second=single)
+        assert single.any() and not np.array_equal(first, single)
+        assert [camera.settings().exposure_ms for camera in rig.cameras] == [1.0, 1.0]
+    saved = capture(tmp_path / "session", "a", TWO, role="scan", exposures_ms=(0.5, 1.0))
+    assert saved.second is not None
+    assert saved.second.exposures_ms == saved.exposures_ms == (0.5, 1.0)
+    saved.verify()
+
+
+@pytest.mark.slow
+def test_two_cameras_are_calibrated_scan_and_merge(tmp_path: Path) -> None:
+    session = str(tmp_path / "session")
+    simulate = ["simulate", session, "--preset", "pair", "--scale", "0.25", "--poses", "10"]
+    assert main(simulate) == 0
+    assert main(["calibrate", session, "--target", "circles:21x16:9"]) == 0
+    with Session.open(session) as store:
+        assert load_record(store, ModelCalibration, "splined").second_camera
+    rig = load_calibration(session, "splined").pinholes
+    assert rig.projector.size == rig.camera.size == (400, 300)
+    assert np.linalg.norm(rig.t) == pytest.approx(260.0, abs=0.2)
+    planes = ["plane_05", "plane_09"]
+    assert main(["verify", session, *planes, "--shape", "plane"]) == 0
+    with Session.open(session) as store:
+        for name in planes:
+            found = load_record(store, Verification, name).models["splined"]
+            assert found.noise_floor_mm is not None
+            ratio = found.rms_mm / found.noise_floor_mm
+            assert 0.85 < ratio < 1.25
+    names = [*spheres()]
+    assert main(["verify", session, *names, "--shape", "sphere"]) == 0
+    scans = ["object_r1", "object_r2", "object_r3"]
+    assert main(["merge", session, *scans, "--reference", "object_r2"]) == 0
+
+
+def test_a_recorded_pair_gives_what_an_independent_decoding_gives(
+    real_data: Path, tmp_path: Path
+) -> None:
+    source, session = real_data / "pairs" / "sphere_two_cameras", tmp_path / "session"
+    described = tmp_path / "sequence.toml"
+    described.write_text(
+        'projector = "1143x720"\ngray_cell_px = 9.0\ngray_origin = -9.0\norder = "name"\n'
+        '[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 12\nperiod_px = 18.0\n'
+        '[[frames]]\nkind = "gray"\naxis = "x"\nbits = 7\n'
+    )
+    images = ["import", "frames", str(source), str(session), "--sequence", str(described)]
+    assert main([*images, "--role", "scan"]) == 0
+    assert main(["import", "opencv-calibration", str(source / "caliInfo.yml"), str(session)]) == 0
+    with Session.open(session) as store:
+        (capture,) = store.captures()
+        pair = load_pair(store)
+        matched = match_second(capture, decode_capture(capture), pair)["x"]
+    # pixels of the limb, whose fringes are dim, are not among the 190,000 of every third row
+    seen = matched.mask & (matched.modulation > 16)
+    points = pair.points(matched)[seen].astype(float)
+    points = points[np.isfinite(points).all(axis=1)]
+    assert len(points) / 3 == pytest.approx(190_000, rel=0.03)
+    radius, residual = fit_sphere(points)
+    assert radius == pytest.approx(10.53, abs=0.015)
+    assert 0.009 < residual < 0.014
+
+
+def fit_sphere(points: np.ndarray) -> tuple[float, float]:
+    """The radius, and the robust standard deviation from it, by algebraic least squares."""
+    kept = np.ones(len(points), bool)
+    for _ in range(8):
+        design = np.column_stack([2 * points, np.ones(len(points))])[kept]
+        found = np.linalg.lstsq(design, (points[kept] ** 2).sum(axis=1), rcond=None)[0]
+        radius = float(np.sqrt(found[3] + found[:3] @ found[:3]))
+        off = np.linalg.norm(points - found[:3], axis=1) - radius
+        sigma = 1.4826 * float(np.median(np.abs(off[kept])))
+        kept = np.abs(off) < 5 * sigma
+    return radius, sigma
