@@ -8,13 +8,15 @@ from pathlib import Path
 import pytest
 from facts import missing_facts
 from test_operator import TARGET, states
-from wizard_events import HANG_S, SPARING, last_notice, wait_until_open
+from wizard_events import HANG_S, SPARING, last_notice, until, wait_until_open
 
+from slviewer.gui.widgets import PICTURE_PX, draw_preview
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.rig_choice import load_rig
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import PreviewView
 
 pytestmark = pytest.mark.computes
 
@@ -256,3 +258,23 @@ def test_a_diagnostic_bundle_tells_no_password(tmp_path: Path) -> None:
         "rtsp://…@camera.local/1" in texts["log.txt"]
         and "camera.local" in texts["session/decisions.json"]
     )
+
+
+def test_a_rig_of_two_cameras_captures_and_shows_both(tmp_path: Path) -> None:
+    previews = list[PreviewView]()
+    rig = {"driver": "simulated", "scale": 0.25, "cameras": 2}
+    with Operator(tmp_path / "session", rig, timing=SPARING) as operator:
+        operator.subscribe(lambda _: None, previews.append)
+        operator.choose_target(TARGET)
+        wait_until_open(operator)
+        assert operator.capture_pose()
+        after = operator.wait_until_idle(HANG_S)
+        assert states(after) == {"pose_01": "good"}
+        until(lambda: any(each.second is not None for each in previews))
+        assert operator.session is not None
+        saved = operator.session.load_capture("pose_01")
+        assert saved.second is not None and saved.other_size == (400, 300)
+        frames = len(saved.sequence.frames)
+        assert after.space is not None and after.space.capture_bytes == 2 * frames * 400 * 300
+        shown = draw_preview(next(each for each in previews if each.second is not None))
+        assert shown.shape[1] == 2 * PICTURE_PX
