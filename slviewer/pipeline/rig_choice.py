@@ -27,6 +27,7 @@ from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, available, driver, 
 from slviewer.devices.protocols import Rig, Turntable
 from slviewer.devices.replay import Recording, recording_rig
 from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.simulated_dlpc350 import simulated_lightcrafter_rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
@@ -220,16 +221,18 @@ def _simulated_setup(
     scale: float = 1.0,
     seed: int = 0,
     thing: Thing = "board",
+    dlpc350: bool = False,
 ) -> RigSetup:
     """Return the simulated rig of a preset, with a thing of `devices.world`, such as the board, in
-    view."""
+    view; ``dlpc350``: its projector is a LightCrafter 4500 that triggers the camera."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     rig = letter(scale, seed)
     world = SimulatedWorld(rig, board)
     if thing != "board":
         world.place(thing)
-    return RigSetup(simulated_rig(world), world, rig.camera.focal_px[0] * scale)
+    make = simulated_lightcrafter_rig if dlpc350 else simulated_rig
+    return RigSetup(make(world), world, rig.camera.focal_px[0] * scale)
 
 
 @dataclass(frozen=True)
