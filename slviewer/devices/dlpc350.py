@@ -118,7 +118,8 @@ class HidTransport:
 
     def read(self, timeout_s: float) -> bytes:
         """Return the next packet; empty where none comes in time."""
-        return bytes(self._device.read(PACKET_BYTES, int(1000 * timeout_s)))
+        # 0 ms would wait for ever
+        return bytes(self._device.read(PACKET_BYTES, max(1, int(1000 * timeout_s))))
 
     def close(self) -> None:
         """Release the device."""

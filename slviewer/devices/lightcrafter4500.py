@@ -87,25 +87,30 @@ class Pictures(Protocol):
 @dataclass(frozen=True)
 class PatternTiming:
     """How a picture is divided: `bits` a pattern, and `per_picture` patterns a refresh, None: as
-    many as fit. `led_currents`: red, green and blue, 0 ... 255, None: as they are.
-    `trigger_delays_us`: of trigger out 1, its rising and falling edge, and of trigger out 2, -20 to
-    2.7. Raises InputError for what does not fit.
+    many as fit, each for `pattern_us`, None: as long as fits.
+
+    `led_currents`: red, green and blue, 0 ... 255, None: as they are. `trigger_delays_us`: of
+    trigger out 1, its rising and falling edge, and of trigger out 2, -20 to 2.7. Raises InputError
+    for what does not fit.
     """
 
     bits: Bits = 8
     per_picture: int | None = None
+    pattern_us: int | None = None
     refresh_hz: float = 60.0
     led_currents: tuple[int, int, int] | None = None
     trigger_delays_us: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.count <= self._most or self.led_currents == (0, 0, 0):
+        shortest = MIN_EXPOSURES_US[self.bits - 1]
+        if not 1 <= self.count <= self._most or self._least_us < shortest:
             raise InputError(
-                f"per_picture = {self.per_picture} of {self.bits} bits, led_currents ="
-                f" {self.led_currents} is impossible: at {self.refresh_hz:g} Hz up to {self._most}"
-                f" such patterns fit a picture, of {self._shortest_us} us or longer, and one LED"
-                " must be on"
+                f"per_picture = {self.per_picture} and pattern_us = {self.pattern_us} do not fit:"
+                f" a pattern of {self.bits} bits takes {shortest} us or longer, and a picture at"
+                f" {self.refresh_hz:g} Hz has room for {self._most} of {self._least_us} us"
             )
+        if self.led_currents == (0, 0, 0):
+            raise InputError("led_currents of 0 give no light: switch one LED on at least")
         if not all(0 <= register <= _LONGEST_DELAY for register in self._delay_registers):
             raise InputError(
                 f"trigger_delays_us = {self.trigger_delays_us} are impossible: give -20 to 2.7 us"
@@ -119,12 +124,13 @@ class PatternTiming:
     @property
     def has_black(self) -> bool:
         """Whether time is left for a black fill before the next picture."""
-        return self.count * self._shortest_us + BLACK_US <= self._refresh_us
+        return self.count * self._least_us + BLACK_US <= self._refresh_us
 
     @property
     def period_us(self) -> int:
         """Exposure of a pattern, which is also its period."""
-        return (self._refresh_us - BLACK_US * self.has_black) // self.count
+        longest = (self._refresh_us - BLACK_US * self.has_black) // self.count
+        return self.pattern_us or longest
 
     @property
     def triggers(self) -> bytes:
@@ -136,8 +142,8 @@ class PatternTiming:
         return int(1e6 / self.refresh_hz)
 
     @property
-    def _shortest_us(self) -> int:
-        return MIN_EXPOSURES_US[self.bits - 1]
+    def _least_us(self) -> int:
+        return self.pattern_us or MIN_EXPOSURES_US[self.bits - 1]
 
     @property
     def _plane_step(self) -> int:
@@ -147,7 +153,7 @@ class PatternTiming:
     @property
     def _most(self) -> int:
         """Patterns that fit a picture."""
-        return min(24 // self._plane_step, self._refresh_us // self._shortest_us)
+        return min(24 // self._plane_step, self._refresh_us // self._least_us)
 
     @property
     def _delay_registers(self) -> list[int]:
@@ -337,6 +343,7 @@ class LightCrafter4500(Openable):
 def _connect(
     bits: Bits = 8,
     per_picture: Annotated[int, msgspec.Meta(ge=1, le=24)] | None = None,
+    pattern_us: Annotated[int, msgspec.Meta(ge=1, le=50_000)] | None = None,
     refresh_hz: Annotated[float, msgspec.Meta(ge=20, le=120)] = 60.0,
     led_currents: tuple[_Current, _Current, _Current] | None = None,
     trigger_delays_us: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -344,7 +351,9 @@ def _connect(
     page: ProjectorChannel | None = None,
 ) -> LightCrafter4500:
     """Return the connected projector, of that serial number; `page` leads to its picture."""
-    timing = PatternTiming(bits, per_picture, refresh_hz, led_currents, trigger_delays_us)
+    timing = PatternTiming(
+        bits, per_picture, pattern_us, refresh_hz, led_currents, trigger_delays_us
+    )
     return LightCrafter4500(BrowserProjector(SIZE, page), partial(open_hid, serial), timing)
 
 

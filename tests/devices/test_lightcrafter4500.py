@@ -1,17 +1,26 @@
 """The LightCrafter 4500: its protocol byte by byte, its pictures plane by plane, bursts and what
 can go wrong with them on a simulated controller."""
 
+import json
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from clocks import SteppingClock
+from copies import copy_session
 from facts import missing_facts, raises
 
 from slviewer.devices.capture import can_burst, capture_frames
-from slviewer.devices.dlpc350 import Command, Dlpc350, lut_entry
-from slviewer.devices.lightcrafter4500 import SIZE, LightCrafter4500, PatternTiming
+from slviewer.devices.dlpc350 import Command, Dlpc350, lut_entry, open_hid
+from slviewer.devices.lightcrafter4500 import (
+    SIZE,
+    LightCrafter4500,
+    PatternTiming,
+    list_lightcrafters,
+)
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import SimulatedProjector
 from slviewer.devices.simulated_dlpc350 import (
@@ -103,6 +112,47 @@ def test_refused_and_missing_answers_are_errors(answer, facts):
         control.read(Command.MAIN_STATUS)
 
 
+class HidDevice:
+    """A device as hidapi has it, which echoes what it gets."""
+
+    def __init__(self) -> None:
+        self.open_path = lambda path: None
+        self.sent = b""
+
+    def write(self, data: bytes) -> int:
+        self.sent = data
+        return -1 if self.sent == b"\0" * 65 else len(data)
+
+    def read(self, length: int, timeout_ms: int) -> list[int]:
+        assert (length, timeout_ms > 0) == (64, True)
+        return list(self.sent[1:])
+
+    def close(self) -> None:
+        self.sent = b""
+
+
+def test_the_device_is_found_by_its_serial_number(monkeypatch):
+    listed = [
+        {"path": b"0", "serial_number": "LCR2", "interface_number": 1},
+        {"path": b"1", "serial_number": "LCR2", "interface_number": 0},
+        {"path": b"2", "serial_number": "LCR3", "interface_number": 0},
+    ]
+    hid = SimpleNamespace(device=HidDevice, enumerate=lambda vendor, product: listed)
+    monkeypatch.setitem(sys.modules, "hid", hid)
+    assert list_lightcrafters() == [
+        "LightCrafter 4500, serial LCR2",
+        "LightCrafter 4500, serial LCR3",
+    ]
+    transport = open_hid("LCR3")
+    transport.write(b"\1" * 64)
+    assert transport.read(0.0) == b"\1" * 64
+    with pytest.raises(OSError, match="write"):
+        transport.write(b"\0" * 64)
+    transport.close()
+    with raises(DeviceError, "LCR4", "slviewer devices"):
+        open_hid("LCR4")
+
+
 def test_an_entry_of_the_look_up_table_has_its_bits_in_place():
     assert lut_entry(0, 8, 7, first=True, black=False).hex() == "017800"
     assert lut_entry(2, 7, 4, first=False, black=True).hex() == "0b4702"
@@ -152,8 +202,10 @@ def test_pictures_have_the_patterns_in_the_planes_of_their_numbers(bits):
         ((7, 2), 2, 8218, True),
         ((4,), 6, 2739, True),
         ((1,), 24, 684, True),
-        ((8, None, 120.0), 1, 8333, False),
-        ((8, None, 40.0), 3, 8333, False),
+        ((8, 1, 8333), 1, 8333, True),  # dark for as long
+        ((7, None, 7000), 2, 7000, True),
+        ((8, None, None, 120.0), 1, 8333, False),
+        ((8, None, None, 40.0), 3, 8333, False),
     ],
 )
 def test_as_many_patterns_fit_a_picture_as_their_shortest_exposures_allow(
@@ -167,8 +219,10 @@ def test_as_many_patterns_fit_a_picture_as_their_shortest_exposures_allow(
     ("settings", "facts"),
     [
         ({"per_picture": 3}, ["per_picture", 3, 8, 60, 2, 8333]),
+        ({"pattern_us": 8000}, ["pattern_us", 8000, 8, 8333]),
+        ({"pattern_us": 17_000}, ["pattern_us", 17000, 60, 0]),
         ({"bits": 7, "per_picture": 4}, ["per_picture", 4, 7, 3, 4500]),
-        ({"led_currents": (0, 0, 0)}, ["led_currents", "LED"]),
+        ({"led_currents": (0, 0, 0)}, ["led_currents", 0, "LED"]),
         ({"trigger_delays_us": (-21.0, 0.0, 0.0)}, ["trigger_delays_us", -21.0, -20, 2.7]),
         ({"trigger_delays_us": (0.0, 3.0, 0.0)}, ["trigger_delays_us", 3.0]),
     ],
@@ -196,7 +250,7 @@ def test_a_picture_holds_patterns_of_one_axis():
 
 
 def test_the_commands_of_an_open_projector(world):
-    timing = PatternTiming(7, None, 60.0, (10, 0, 255), (-10.0, 0.0, 2.68))
+    timing = PatternTiming(7, None, None, 60.0, (10, 0, 255), (-10.0, 0.0, 2.68))
     rig, controller = simulated_lightcrafter(world, timing)
     with rig.opened():
         received = dict(controller.received)
@@ -281,12 +335,11 @@ def test_a_projector_that_cannot_be_opened_is_closed(world, fault):
         rig.projector.show_level(100)
 
 
-@pytest.mark.parametrize(("fault", "bit"), [("frozen", 2)])
-def test_a_frozen_buffer_ends_a_single_frame_too(lightcrafter, fault, bit):
+def test_a_frozen_buffer_ends_a_single_frame_too(lightcrafter):
     rig, controller = lightcrafter
     rig.projector.load(SHORT)
     rig.projector.show(0)
-    controller.fault = fault
+    controller.fault = "frozen"
     with raises(DeviceError, "frozen"):
         rig.projector.show(1)
 
@@ -304,6 +357,24 @@ def test_the_preflight_times_both_modes_and_names_a_lost_trigger(lightcrafter):
     controller.fault = "trigger lost"
     lost = preflight(rig, clock=clock).check("burst")
     assert lost.verdict == "bad" and not missing_facts(lost.sentence, "trigger", 30)
+
+
+@pytest.mark.computes
+@pytest.mark.slow
+def test_the_terminal_scans_verifies_and_merges_with_bursts(recorded, tmp_path, run):
+    session = copy_session(recorded / "session", tmp_path / "session")
+    rig = tmp_path / "rig.toml"
+    rig.write_text('driver = "simulated"\nscale = 0.25\ndlpc350 = true\nthing = "sphere"\n')
+    for name in ("ball_1", "ball_2"):
+        assert run("capture", session, name, "--rig", rig, "--role", "scan")[0] == 0
+        assert run("reconstruct", session, name)[0] == 0
+    out = tmp_path / "out.json"
+    assert run("verify", session, "ball_1", "--shape", "sphere", "--json", out)[0] == 0
+    fit = json.loads(out.read_text())["verify"]["ball_1"]["models"]["splined"]
+    assert fit["radius_mm"] == pytest.approx(98, abs=0.2) and 0.005 < fit["rms_mm"] < 0.1
+    merge = ("merge", session, "ball_2", "--reference", "ball_1", "--start", "identity")
+    status, _, error = run(*merge)
+    assert status == 0, error
 
 
 def test_the_simulated_rig_is_chosen_by_an_option():
