@@ -38,7 +38,7 @@ def capture_frames(
     `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled)
     to stop. `sleep(seconds)` waits for the light to settle. Raises DeviceError, with the frame at
     which it happened; whatever is raised, `out` then holds no capture and the rig can be used again
-    once its device answers. The projector is left showing the last frame.
+    once its device answers. The projector is left showing the last frame, or dark after a burst.
     """
     with report_driver_faults(rig.projector):
         rig.projector.load(sequence)

@@ -51,7 +51,7 @@ class Command(IntEnum):
     MAILBOX_DATA = 0x1A34
 
 
-STOP, START = 0, 2
+RUN_STOPPED, RUN_STARTED = 0, 2
 """Arguments of `Command.RUN`."""
 
 _STATUS = (
@@ -196,6 +196,14 @@ class Dlpc350:
                     " switch it off and on"
                 )
 
+    def start(self) -> None:
+        """Start the sequence, and wait until it runs."""
+        self.set(Command.RUN, RUN_STARTED)
+        end = self._clock() + _SETTLE_S
+        while not self.read(Command.MAIN_STATUS) & 2 and self._clock() < end:
+            pass
+        self.check_running()
+
     def check_running(self) -> None:
         """Raise DeviceError unless it shows pictures as they come."""
         main = self.read(Command.MAIN_STATUS)
@@ -220,7 +228,7 @@ class Dlpc350:
         In this mode a pattern is exposed for its whole period.
         """
         n = len(entries)
-        self.set(Command.RUN, STOP)
+        self.set(Command.RUN, RUN_STOPPED)
         self.set(Command.DISPLAY_MODE, 1)
         for command, data in (
             (Command.PATTERN_SOURCE, b"\0"),

@@ -21,8 +21,7 @@ from slviewer.devices.browser import BrowserProjector, ProjectorChannel
 from slviewer.devices.dlpc350 import (
     BLACK_US,
     MIN_EXPOSURES_US,
-    START,
-    STOP,
+    RUN_STOPPED,
     Command,
     Dlpc350,
     Transport,
@@ -42,7 +41,7 @@ Bits = Literal[1, 2, 4, 7, 8]
 
 _TRIGGER_STEP_US, _NO_DELAY, _LONGEST_DELAY = 0.1072, 0xBB, 0xD5
 """Register of the trigger delays: step, and its values for 0 and for the longest delay."""
-_LEAD, _SPARE = 3, 15
+_LEAD, _SPARE = 3, 20
 """Dark pictures before and after a burst (the controller shows a picture one refresh after it
 arrived), and how many refreshes starting and stopping may take."""
 _Current = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -50,7 +49,7 @@ _PARALLEL_24_BIT = 0x08
 """Input source: the parallel port, to which the board leads HDMI, 24 bits."""
 
 
-class Picture(NamedTuple):
+class PackedPicture(NamedTuple):
     """A picture of 24 bits that varies along an axis: (extent, 3) RGB."""
 
     axis: Axis
@@ -77,7 +76,7 @@ class Pictures(Protocol):
     def show_level(self, grey: int | None) -> None:
         """Show even grey."""
 
-    def load_pictures(self, pictures: Sequence[Picture]) -> None:
+    def load_pictures(self, pictures: Sequence[PackedPicture]) -> None:
         """Load pictures of 24 bits, in place of a sequence."""
 
     def play(self) -> None:
@@ -186,7 +185,7 @@ class PatternTiming:
             word |= rounded << (step * k + step - self.bits)
         return np.stack([word >> shift & 0xFF for shift in (8, 0, 16)], axis=1).astype(np.uint8)
 
-    def divide(self, sequence: PatternSequence) -> tuple[list[Picture], tuple[int, ...]]:
+    def divide(self, sequence: PatternSequence) -> tuple[list[PackedPicture], tuple[int, ...]]:
         """Return the pictures of a sequence, and the place among their patterns of each frame.
 
         A picture varies along one axis: places may stay empty. Raises InputError for grey levels in
@@ -209,7 +208,7 @@ class PatternTiming:
             # even light is as long as the projector is wide
             extent = sequence.extent(axis or "x")
             rgb = self.pack([np.resize(levels, extent) for levels in patterns])
-            pictures.append(Picture(axis or "x", rgb))
+            pictures.append(PackedPicture(axis or "x", rgb))
         return pictures, tuple(places)
 
 
@@ -264,7 +263,7 @@ class LightCrafter4500(Openable):
         control, self._control, self._sequence = self._control, None, None
         if control:
             with contextlib.suppress(DeviceError):
-                control.set(Command.RUN, STOP)
+                control.set(Command.RUN, RUN_STOPPED)
                 control.set(Command.DISPLAY_MODE, 0)
             control.close()
         self._pictures.close()
@@ -298,7 +297,7 @@ class LightCrafter4500(Openable):
         control, timing = self._require_control(), self._timing
         pictures, places = timing.divide(sequence)
         dark, white = (
-            Picture("x", np.full((self.size[0], 3), level, np.uint8)) for level in (0, 255)
+            PackedPicture("x", np.full((self.size[0], 3), level, np.uint8)) for level in (0, 255)
         )
         dim = [dark] * _LEAD
         self._pictures.show_level(None)
@@ -312,17 +311,17 @@ class LightCrafter4500(Openable):
     def run(self) -> None:
         """Show what was prepared once."""
         control = self._require_control()
-        control.set(Command.RUN, START)
+        control.start()
         self._pictures.play()
         control.check_running()
-        control.set(Command.RUN, STOP)
+        control.set(Command.RUN, RUN_STOPPED)
 
     def _step(self) -> Dlpc350:
         """Return the control, which shows each picture as one pattern from now on."""
         control = self._require_control()
         if not self._is_stepping:
             self._send(control, is_burst=False)
-            control.set(Command.RUN, START)
+            control.start()
             self._is_stepping = True
         return control
 

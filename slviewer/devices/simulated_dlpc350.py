@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from slviewer.devices.dlpc350 import NACK, PACKET_BYTES, READ, START, Command
-from slviewer.devices.lightcrafter4500 import LightCrafter4500, PatternTiming, Picture
+from slviewer.devices.dlpc350 import NACK, PACKET_BYTES, READ, RUN_STARTED, Command
+from slviewer.devices.lightcrafter4500 import LightCrafter4500, PackedPicture, PatternTiming
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import SimulatedCamera, SimulatedProjector
 from slviewer.devices.world import SimulatedWorld
@@ -87,7 +87,7 @@ class SimulatedDlpc350:
         self._registers: dict[int, bytes] = {}
         self._lut: list[int] = []
         self._message, self._answers = b"", deque[bytes]()
-        self._picture = Picture("x", np.zeros((projector.size[0], 3), np.uint8))
+        self._picture = PackedPicture("x", np.zeros((projector.size[0], 3), np.uint8))
         self._triggers = 0
 
     def connect(self) -> "SimulatedDlpc350":
@@ -120,7 +120,7 @@ class SimulatedDlpc350:
         self._check_plugged()
         return self._answers.popleft() if self._answers else b""
 
-    def refresh(self, picture: Picture, preview: bool = False) -> None:
+    def refresh(self, picture: PackedPicture, preview: bool = False) -> None:
         """Receive a picture of the video port, and show its patterns."""
         if self.fault != "frozen":
             self._picture = picture
@@ -141,7 +141,7 @@ class SimulatedDlpc350:
 
     @property
     def _is_running(self) -> bool:
-        return self._get(Command.RUN) == START
+        return self._get(Command.RUN) == RUN_STARTED
 
     def _check_plugged(self) -> None:
         if self.fault == "unplugged":
@@ -196,7 +196,7 @@ class SimulatedVideo:
     def __init__(self, projector: SimulatedProjector, controller: SimulatedDlpc350) -> None:
         self.size = projector.size
         self._projector, self._controller = projector, controller
-        self._pictures: Sequence[Picture] = ()
+        self._pictures: Sequence[PackedPicture] = ()
 
     def open(self) -> None:
         """Claim the world's projector."""
@@ -221,7 +221,7 @@ class SimulatedVideo:
         picture = _make_grey(None, np.full(self.size[0], grey or 0, np.uint8))
         self._controller.refresh(picture, preview=True)
 
-    def load_pictures(self, pictures: Sequence[Picture]) -> None:
+    def load_pictures(self, pictures: Sequence[PackedPicture]) -> None:
         """Load pictures of 24 bits."""
         self._pictures = pictures
 
@@ -233,8 +233,8 @@ class SimulatedVideo:
                 self._controller.refresh(picture)
 
 
-def _make_grey(axis: Axis | None, levels: np.ndarray) -> Picture:
-    return Picture(axis or "x", np.repeat(levels[:, None], 3, axis=1))
+def _make_grey(axis: Axis | None, levels: np.ndarray) -> PackedPicture:
+    return PackedPicture(axis or "x", np.repeat(levels[:, None], 3, axis=1))
 
 
 def simulated_lightcrafter(

@@ -13,6 +13,8 @@ from clocks import SteppingClock
 from copies import copy_session
 from facts import missing_facts, raises
 
+from slviewer.devices import drivers as drivers_module
+from slviewer.devices.browser import PageChannels
 from slviewer.devices.capture import can_burst, capture_frames
 from slviewer.devices.dlpc350 import Command, Dlpc350, lut_entry, open_hid
 from slviewer.devices.lightcrafter4500 import (
@@ -34,7 +36,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import gray, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.pipeline.rig_choice import set_up
+from slviewer.pipeline.rig_choice import check_choice, list_needed_pages, set_up
 from slviewer.preflight.check_rig import preflight
 from slviewer.simulation.rig import letter
 
@@ -375,6 +377,29 @@ def test_the_terminal_scans_verifies_and_merges_with_bursts(recorded, tmp_path, 
     merge = ("merge", session, "ball_2", "--reference", "ball_1", "--start", "identity")
     status, _, error = run(*merge)
     assert status == 0, error
+
+
+def test_a_rig_file_chooses_the_driver_and_its_settings(monkeypatch):
+    choice = {
+        "camera": {"driver": "browser", "size": [64, 48]},
+        "projector": {"driver": "lightcrafter4500", "bits": 7, "serial": "LCR3"},
+    }
+    check_choice(choice, "the rig")
+    assert list_needed_pages(choice) == ("projector", "camera")
+    monkeypatch.setattr(drivers_module, "find_spec", lambda name: None)
+    with raises(DeviceError, "hid", "pip install 'slviewer[lightcrafter]'"):
+        set_up(choice, None, pages=PageChannels())
+    monkeypatch.setattr(drivers_module, "find_spec", lambda name: name)
+    projector = set_up(choice, None, pages=PageChannels()).rig.projector
+    assert isinstance(projector, LightCrafter4500) and projector.size == (912, 1140)
+    for settings, facts in (
+        ({"bits": 3}, ["bits", 3]),
+        ({"size": [912, 1140]}, ["size", "per_picture", "serial"]),
+        ({"led_currents": [1, 2, 256]}, ["led_currents", 256]),
+    ):
+        wrong = {**choice, "projector": {"driver": "lightcrafter4500", **settings}}
+        with raises(InputError, "lightcrafter4500" if "size" in settings else "wrong", *facts):
+            check_choice(wrong, "the rig")
 
 
 def test_the_simulated_rig_is_chosen_by_an_option():
