@@ -33,7 +33,7 @@ from slviewer.devices.protocols import (
 )
 from slviewer.errors import DeviceError
 from slviewer.fringe.patterns import profile
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence
 
 FRAME_S = 10.0
 """How long a picture may take, from the request until it has arrived here."""
@@ -222,6 +222,7 @@ class BrowserCamera(PageDevice[CameraChannel], CameraDriver):
 
 
 _MAX_SIZE_PX = 16384
+_SLOWEST_HZ = 20.0
 
 
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**16)]
@@ -384,24 +385,46 @@ class BrowserProjector(PageDevice[ProjectorChannel]):
         DeviceError."""
         self.check_open()
         check_sequence(self, sequence)
+        self._send([profile(sequence, k) for k in range(len(sequence.frames))])
+        self._sequence = sequence
+
+    def load_pictures(self, pictures: Sequence[tuple[Axis, np.ndarray]]) -> None:
+        """Load pictures for `play` in place of a sequence: the axis along which each varies, and
+        its (extent, 3) RGB."""
+        self.check_open()
+        self._send(pictures)
+
+    def play(self) -> None:
+        """Show what is loaded, a picture a refresh of the display; returns when the last one is
+        shown."""
+        self.check_open()
+        many = len(self._sent[0]) if self._sent else 0
+        self._request("play", timeout_s=ANSWER_S + many / _SLOWEST_HZ)
+
+    def _send(self, profiles: Sequence[tuple[Axis | None, np.ndarray]]) -> None:
+        """Send pictures that the page lacks, grey (extent,) or RGB (extent, 3) along an axis."""
         page = self._pages.page()
-        profiles = [profile(sequence, k) for k in range(len(sequence.frames))]
         axes: list[str] = [axis or "x" for axis, _ in profiles]
         sent = axes, b"".join(levels.tobytes() for _, levels in profiles)
         if page is not self._page or sent != self._sent:
             self._forget_loaded()
             page.request("load", sent[1], size=self.size, axes=axes)
-        self._sequence, self._sent, self._page, self._changes = sequence, sent, page, page.changes
+        self._sequence = None
+        self._sent, self._page, self._changes = sent, page, page.changes
 
     def show(self, index: int) -> None:
         """Show frame `index`. Raises DeviceError where the page or its size changed since the
         patterns were sent."""
         self.check_open()
         check_index(self, self._sequence, index)
+        self._request("show", index=index)
+
+    def _request(self, op: str, timeout_s: float | None = None, **fields: Any) -> None:
+        """Let the page show what it was sent, and check that it still is as it was then."""
         page = self._page
         try:
             assert page
-            page.request("show", index=index)
+            page.request(op, timeout_s=timeout_s, **fields)
             if page.changes != self._changes:
                 raise DeviceError(
                     "the projector page's window changed while patterns were shown: capture again"

@@ -9,10 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slviewer.devices.protocols import (
+    BurstProjector,
     Camera,
     CameraSettings,
     ColourCamera,
+    PatternBurst,
     Rig,
+    TriggeredCamera,
     read_lens,
     report_driver_faults,
 )
@@ -32,12 +35,13 @@ def capture_frames(
     second: np.ndarray | None = None,
 ) -> np.ndarray:
     """Capture the frames (n, h, w) of `sequence` with the open rig, into `out` if it is given, and
-    those of its second camera into `second`.
+    those of its second camera into `second`; as a burst where its camera is triggered by its
+    projector.
 
     `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled)
     to stop. `sleep(seconds)` waits for the light to settle. Raises DeviceError, with the frame at
     which it happened; whatever is raised, `out` then holds no capture and the rig can be used again
-    once its device answers. The projector is left showing the last frame.
+    once its device answers. The projector is left showing the last frame, or dark after a burst.
     """
     with report_driver_faults(rig.projector):
         rig.projector.load(sequence)
@@ -71,6 +75,10 @@ def _capture_loaded(
     cameras."""
     report = progress or (lambda done, n: None)
     report(places.start, len(stacks[0]))
+    if can_burst(rig):
+        _capture_burst(rig, stacks[0][places.start : places.stop])
+        report(places.stop, len(stacks[0]))
+        return
     for k, place in enumerate(places):
         try:
             with report_driver_faults(rig.projector):
@@ -90,6 +98,66 @@ def _capture_loaded(
                 f" discarded: {error}"
             ) from error
         report(place + 1, len(stacks[0]))
+
+
+_SAMPLED_STEP = 8
+"""Every how many rows and columns the light of a frame is taken from."""
+
+
+def can_burst(rig: Rig) -> bool:
+    """Whether the projector of a rig shows a sequence by itself and triggers the rig's camera."""
+    able = isinstance(rig.projector, BurstProjector) and isinstance(rig.camera, TriggeredCamera)
+    return rig.bursts and able and rig.second is None
+
+
+def _capture_burst(rig: Rig, out: np.ndarray) -> None:
+    """Capture the loaded frames into `out` (n, h, w) at the pace of the projector.
+
+    Raises DeviceError unless as many frames came as there were triggers.
+    """
+    camera, projector = rig.camera, rig.projector
+    assert isinstance(camera, TriggeredCamera) and isinstance(projector, BurstProjector)
+    with report_driver_faults(projector):
+        burst = projector.prepare()
+    frames = np.empty((burst.most, *out.shape[1:]), out.dtype)
+    try:
+        with report_driver_faults(camera):
+            camera.arm(burst.most)
+        with report_driver_faults(projector):
+            projector.run()
+        with report_driver_faults(camera):
+            came = 0
+            while came < burst.most and camera.fetch(frames[came]):
+                came += 1
+    finally:
+        # a lost device raises its own error
+        with contextlib.suppress(DeviceError), report_driver_faults(camera):
+            camera.disarm()
+    first = _find_first_pattern(frames[:came], burst)
+    for frame, place in zip(out, burst.places, strict=True):
+        frame[:] = frames[first + place]
+
+
+def _find_first_pattern(frames: np.ndarray, burst: PatternBurst) -> int:
+    """Return the index of a burst's first pattern among its frames (n, h, w), the one after the
+    white marker. Raises DeviceError where the markers are not as far apart as they were shown."""
+    light = frames[:, ::_SAMPLED_STEP, ::_SAMPLED_STEP].mean(axis=(1, 2))
+    bright = np.flatnonzero(light > (light.min(initial=np.inf) + light.max(initial=0)) / 2)
+    wanted = burst.length + 2 * burst.marker
+    came = int(bright[-1] - bright[0]) + 1 if len(bright) else 0
+    if came > wanted:
+        raise DeviceError(
+            f"{came} frames came of a burst of {wanted}, a picture stood for two refreshes, and its"
+            " frames were discarded: end what loads this computer's graphics, then capture again"
+        )
+    if came < wanted:
+        raise DeviceError(
+            f"the trigger was lost, {came} of {wanted} frames came of a burst with"
+            f" {burst.period_ms:.3g} ms a pattern, and its frames were discarded: set an exposure"
+            " that leaves the camera time to be ready again, check the trigger's cable, or set"
+            " fewer patterns a picture"
+        )
+    return int(bright[0]) + burst.marker
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from slviewer.devices.gentl import (
     Image,
     Link,
     ListedCamera,
+    NoFrameError,
     as_device_error,
     list_cameras,
     open_node_map,
@@ -28,6 +29,7 @@ from slviewer.devices.protocols import (
     CameraSettings,
     Channel,
     check_channel,
+    check_frame,
     extract_channel,
 )
 from slviewer.errors import DeviceError, InputError
@@ -286,6 +288,8 @@ IN_FLIGHT = 2
 arrive after it: one that is being exposed, and the one before, which is being read out and sent."""
 
 _ANSWER_TIMEOUT_S = 2.0
+_SENDING_S = 0.1
+"""What an image takes to arrive after its exposure."""
 
 
 @dataclass(eq=False)
@@ -302,7 +306,8 @@ class GenicamCamera(CameraDriver):
     and `gain` are set when it is opened, None: unchanged. `pixel_format` None: the deepest mono of
     up to 12 bits that comes unpacked; of a colour camera its colours, of which `grab` decodes the
     `channel`, and `grab_colour` all three. `trigger` "software" (where it has one), "hardware" with
-    the name of its `line`, or "free". Raises InputError for what the camera has not, or where
+    the name of its `line`, or "free"; by hardware it also takes the bursts of a projector that
+    triggers it. Raises InputError for what the camera has not, or where
     several fit; DeviceError where none is connected.
     """
 
@@ -331,6 +336,8 @@ class GenicamCamera(CameraDriver):
         self.dtype, self.full_scale = self.pixels.dtype, 2**self.pixels.bits - 1
         if self.pixels.colour:
             self.grab_colour = self._grab_colour  # which makes it a `ColourCamera`
+        if self._trigger == "hardware":
+            self.arm = self._arm  # which makes it a `TriggeredCamera`
         self._link: Link | None = None
         self._timeout_s = _ANSWER_TIMEOUT_S
 
@@ -361,10 +368,36 @@ class GenicamCamera(CameraDriver):
 
     def _fill(self, out: np.ndarray) -> None:
         with self._grab_fresh() as image:
-            if self.pixels.colour:
-                extract_channel(self._convert_rgb(image), self.channel, out)
-            else:
-                self.pixels.unpack(image.data, out, image.padding)
+            self._unpack(image, out)
+
+    def _arm(self, frames: int) -> None:
+        """Wait for up to `frames` triggers from now on."""
+        self.check_open()
+        assert self._link
+        self._link.stop()
+        self._link.start(frames)
+
+    def fetch(self, out: np.ndarray) -> bool:
+        """Fill `out` (h, w) with the next triggered frame; False where none comes any more."""
+        check_frame(self, out)
+        try:
+            with self._next_image(self._timeout_s - _ANSWER_TIMEOUT_S + _SENDING_S) as image:
+                self._unpack(image, out)
+        except NoFrameError:
+            return False
+        return True
+
+    def disarm(self) -> None:
+        """Stop waiting, and discard what is left."""
+        if self._link:
+            self._link.stop()
+
+    def _unpack(self, image: Image, out: np.ndarray) -> None:
+        """Write what is decoded of an image."""
+        if self.pixels.colour:
+            extract_channel(self._convert_rgb(image), self.channel, out)
+        else:
+            self.pixels.unpack(image.data, out, image.padding)
 
     def _grab_colour(self) -> np.ndarray:
         """Grab a frame whose exposure began after the call, (h, w, 3) RGB."""
@@ -404,15 +437,23 @@ class GenicamCamera(CameraDriver):
             else:
                 for _ in range(IN_FLIGHT):
                     link.drop_next(self._timeout_s)
-            with link.next(self._timeout_s, self.pixels.nbytes) as image:
-                if image.size != self.size:
-                    raise DeviceError(
-                        f"{self.name} sent a frame of {image.size}, not {self.size}: choose it anew"
-                    )
+            with self._next_image(self._timeout_s) as image:
                 yield image
         except BaseException:
             link.stop()  # what is still on its way must not be the next grab's
             raise
+
+    @contextlib.contextmanager
+    def _next_image(self, timeout_s: float) -> Iterator[Image]:
+        """Yield the next image. Raises DeviceError for one of another size."""
+        self.check_open()
+        assert self._link
+        with self._link.next(timeout_s, self.pixels.nbytes) as image:
+            if image.size != self.size:
+                raise DeviceError(
+                    f"{self.name} sent a frame of {image.size}, not {self.size}: choose it anew"
+                )
+            yield image
 
     def _get_features(self) -> Features:
         """Return the features of the open camera."""

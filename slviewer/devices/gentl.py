@@ -192,6 +192,10 @@ def ignore_errors(step: Callable[[], object]) -> None:
         _LOG.info("while closing: %s", error)
 
 
+class NoFrameError(DeviceError):
+    """A camera that gave no frame in time."""
+
+
 _POLL_S = 0.0005
 _LINKS: dict[ListedCamera, "Link"] = {}
 
@@ -284,9 +288,10 @@ class Link:
                 ignore_errors(lambda: self._harvester.image_acquirers.remove(acquirer))
             self._producer.close()
 
-    def start(self) -> None:
-        """Start streaming into empty buffers."""
+    def start(self, buffers: int = 3) -> None:
+        """Start streaming into so many empty buffers, or the fewest that the camera allows."""
         with as_device_error(self.name):
+            self._acquirer.num_buffers = max(buffers, self._acquirer.min_num_buffers)
             self._format = self.node_map.PixelFormat.get_int_value()
             self._acquirer.start()
         self.streaming = True
@@ -345,7 +350,7 @@ class Link:
             if buffer is not None or self._incomplete.count != before:
                 return buffer
             if time.monotonic() > until:
-                raise DeviceError(
+                raise NoFrameError(
                     f"{self.name} gave no frame within {timeout_s:.1f} s: check its cable, its"
                     " trigger and its exposure"
                 )

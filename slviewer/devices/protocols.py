@@ -202,6 +202,50 @@ class Projector(Protocol):
         stays loaded."""
 
 
+@dataclass(frozen=True)
+class PatternBurst:
+    """A sequence that is shown at once, with a trigger for each pattern: dark, `marker` white ones,
+    `length` patterns of which each frame has its place in `places`, `marker` white ones, dark;
+    `most` triggers in all.
+    """
+
+    places: tuple[int, ...]
+    marker: int
+    length: int
+    period_ms: float
+    most: int
+
+    @property
+    def seconds(self) -> float:
+        """How long the patterns and their markers last."""
+        return (self.length + 2 * self.marker) * self.period_ms / 1000
+
+
+@runtime_checkable
+class BurstProjector(Projector, Protocol):
+    """A projector that shows a sequence by itself, and triggers a camera with each pattern."""
+
+    def prepare(self) -> PatternBurst:
+        """Stop, dark and without triggers; returns what `run` shows of the loaded sequence."""
+
+    def run(self) -> None:
+        """Show what was prepared once; returns when it has ended."""
+
+
+@runtime_checkable
+class TriggeredCamera(Camera, Protocol):
+    """A camera that exposes frames by triggers at a line, and buffers them."""
+
+    def arm(self, frames: int) -> None:
+        """Wait for up to `frames` triggers from now on."""
+
+    def fetch(self, out: np.ndarray) -> bool:
+        """Fill `out` (h, w) with the next triggered frame; False where none comes any more."""
+
+    def disarm(self) -> None:
+        """Stop waiting, and discard what is left."""
+
+
 class Turntable(Protocol):
     """Turns what stands before the rig about an axis; `name` and `limits_deg` can be read before it
     is open.
@@ -280,7 +324,7 @@ class Rig:
     Of two cameras, the `second` takes a frame of each pattern after the first, and is calibrated in
     the projector's place. `settle_ms` passes between "shown" and the grab: the measured delay of
     the light after the projector's report. A `turntable` is opened by what uses it: captures do not
-    need it.
+    need it. `bursts`: whether a capture may be a burst, where camera and projector can.
     """
 
     name: str
@@ -289,6 +333,7 @@ class Rig:
     settle_ms: float = 0.0
     turntable: Turntable | None = None
     second: Camera | None = None
+    bursts: bool = True
 
     @property
     def cameras(self) -> tuple[Camera, ...]:

@@ -124,15 +124,16 @@ class SimulatedProjector(Openable):
         """Show frame `index`."""
         self.check_open()
         check_index(self, self._sequence, index)
-        self._show_pattern(self._profiles[index], preview=False)
+        self.show_pattern(self._profiles[index], preview=False)
 
     def show_level(self, grey: int | None) -> None:
         """Show even light, for previews."""
         self.check_open()
-        self._show_pattern((None, np.full(self.size[0], check_level(grey), np.uint8)), preview=True)
+        self.show_pattern((None, np.full(self.size[0], check_level(grey), np.uint8)), preview=True)
 
-    def _show_pattern(self, pattern: tuple[Axis | None, np.ndarray], preview: bool) -> None:
-        """Show a pattern in the world, with the lamp's flicker and the noise seed of this frame."""
+    def show_pattern(self, pattern: tuple[Axis | None, np.ndarray], preview: bool) -> None:
+        """Show a pattern as `fringe.patterns.profile` returns it, with the lamp's flicker and the
+        noise seed of this frame."""
         self._shows += 1
         rig = self.world.rig
         seed = (rig.seed, self._loads, self._shows, 0xDE)

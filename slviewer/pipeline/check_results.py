@@ -10,7 +10,7 @@ CheckVerdict = Literal["good", "warning", "bad", "unknown"]
 
 CheckName = Literal[
     "screen", "latency", "order", "repeats", "exposure", "gamma", "pixels", "flicker", "ambient",
-    "motion",
+    "motion", "burst",
     "turntable", "description", "noise", "decoding",
 ]  # fmt: skip
 

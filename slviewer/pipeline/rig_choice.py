@@ -27,6 +27,7 @@ from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, available, driver, 
 from slviewer.devices.protocols import Rig, Turntable
 from slviewer.devices.replay import Recording, recording_rig
 from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.simulated_dlpc350 import simulated_lightcrafter_rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
@@ -225,16 +226,21 @@ def _simulated_setup(
     seed: int = 0,
     thing: Thing = "board",
     cameras: Literal[1, 2] = 1,
+    dlpc350: bool = False,
 ) -> RigSetup:
     """Return the simulated rig of a preset, with a thing of `devices.world`, such as the board, in
-    view, and one camera or two."""
+    view, and one camera or two; ``dlpc350``: its projector is a LightCrafter 4500 that triggers the
+    camera, if that is one."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     rig = letter(scale, seed)
     world = SimulatedWorld(rig, board)
     if thing != "board":
         world.place(thing)
-    return RigSetup(simulated_rig(world, cameras), world, rig.camera.focal_px[0] * scale)
+    made = simulated_rig(world, cameras)
+    if dlpc350:
+        made = replace(simulated_lightcrafter_rig(world), second=made.second)
+    return RigSetup(made, world, rig.camera.focal_px[0] * scale)
 
 
 @dataclass(frozen=True)

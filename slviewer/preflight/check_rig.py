@@ -3,8 +3,10 @@ with?"""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
+from slviewer.devices.capture import can_burst
 from slviewer.devices.protocols import Rig, report_driver_faults
 from slviewer.errors import DeviceError
 from slviewer.pipeline.capture import RigSettings, set_camera
@@ -20,7 +22,7 @@ from slviewer.preflight.light import (
     check_flicker,
     check_gamma,
 )
-from slviewer.preflight.order import check_order
+from slviewer.preflight.order import check_burst, check_order
 from slviewer.preflight.recorded_capture import preflight_capture
 from slviewer.preflight.rig_under_test import SYSTEM_CLOCK, Clock, RigUnderTest
 from slviewer.preflight.screen import check_pixels, check_screen
@@ -128,7 +130,7 @@ def preflight(
             if say is not None:
                 say(check.sentence if not check.remedy else f"{check.sentence} {check.remedy}")
 
-    bench = RigUnderTest(rig, tick, clock)
+    bench = RigUnderTest(replace(rig, bursts=False), tick, clock)
     bench.measure_references()
     delay, settle_ms = measure_latency(bench)
     if settle_ms is None:
@@ -157,6 +159,9 @@ def preflight(
         bench.grab_mean(grey, "what changed meanwhile", _AVERAGED_IMAGES) for grey in (None, 255)
     )
     add(check_ambient(bench, last_dark), check_motion(bench, images, last_white))
+    if can_burst(rig):
+        tick("a burst")
+        add(check_burst(bench))
     if rig.turntable is not None:
         tick("turning the turntable")
         add(check_turning(rig.turntable))

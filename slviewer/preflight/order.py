@@ -1,13 +1,15 @@
 """Is frame k of a capture pattern k? A burst of coded frames decides."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from slviewer.devices.capture import capture_frames
-from slviewer.devices.protocols import stated_full_scale
+from slviewer.devices.protocols import BurstProjector, stated_full_scale
+from slviewer.errors import DeviceError
 from slviewer.examination.examine import examine
-from slviewer.fringe.presets import phase_steps
+from slviewer.fringe.presets import bits_for, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
@@ -95,6 +97,47 @@ def _describe_order(
             "Wait longer between showing and grabbing, or lock the camera to the projector.",
         )
     return "good", f"All {n} coded frames came in order.", ""
+
+
+def check_burst(bench: RigUnderTest) -> Check:
+    """Check that a burst captures what the same patterns do one by one, and time both."""
+    rig, size = bench.rig, bench.rig.projector.size
+    bits = max(7, bits_for(size[0] / 18))
+    sequence = PatternSequence(size, (*phase_steps("x", 18, 18.0), *gray_bits("x", bits)))
+    began = bench.clock.now()
+    single = capture_frames(
+        replace(rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep
+    )
+    single_s = bench.clock.now() - began
+    assert isinstance(rig.projector, BurstProjector)
+    burst_s, n = rig.projector.prepare().seconds, len(single)
+    figures: dict[str, Any] = {
+        "frames": n,
+        "burst_s": round(burst_s, 3),
+        "single_s": round(single_s, 3),
+    }
+    try:
+        burst = capture_frames(replace(rig, bursts=True), sequence)
+    except DeviceError as error:
+        what, _, remedy = str(error).rpartition(": ")
+        sentence, remedy = (f"{part[:1].upper()}{part[1:]}." for part in (what, remedy))
+        return Check("burst", "bad", sentence, remedy, figures)
+    bursts, singles = (
+        stack[:, :: bench.stride, :: bench.stride][:, bench.illuminated].astype(np.float32)
+        for stack in (burst, single)
+    )
+    looks_like = [int(np.abs(row - singles).mean(axis=1).argmin()) for row in bursts]
+    wrong = [k + 1 for k, other in enumerate(looks_like) if other != k]
+    figures |= {"misplaced_frames": wrong}
+    if wrong:
+        sentence = f"Frame {wrong[0]} of a burst of {n} does not show pattern {wrong[0]}."
+        remedy = "Set refresh_hz to the refresh rate of the projector's display."
+        return Check("burst", "bad", sentence, remedy, figures)
+    sentence = (
+        f"A burst shows {n} frames in {burst_s:.2f} s, all in order; one by one they take"
+        f" {single_s:.2f} s."
+    )
+    return Check("burst", "good", sentence, "", figures)
 
 
 def _is_lagging_by(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:

@@ -52,9 +52,15 @@ def session(tmp_path: Path):
 
 def test_what_is_shipped_can_be_chosen():
     shipped = {preset.name: preset for preset in presets()}
-    assert {"simulated", "replay", "webcam", "lightcrafter4500", "turntable", "two-cameras"} == set(
-        shipped
-    )
+    assert set(shipped) == {
+        "lightcrafter4500",
+        "replay",
+        "simulated",
+        "simulated-lightcrafter4500",
+        "turntable",
+        "two-cameras",
+        "webcam",
+    }
     for preset in shipped.values():
         assert preset.what.endswith(".") and "rigs" in preset.source.parts
         assert preset.problem == "" or "package" in preset.problem

@@ -197,6 +197,34 @@ def test_frames_appear_in_the_order_in_which_they_are_asked_for(opens, channel, 
     )
 
 
+def test_pictures_of_24_bits_are_played_one_a_refresh(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    rng = np.random.default_rng(5)
+    pictures = [
+        (axis, rng.integers(0, 256, (SIZE[axis == "y"], 3), dtype=np.uint8)) for axis in "xyxyx"
+    ]
+    # the colour of the first pixel at each animation frame, until it is that of the last picture
+    page.evaluate("""window.held = []; (function look() {
+            held.push([...context.getImageData(0, 0, 1, 1).data].slice(0, 3).join(" "));
+            requestAnimationFrame(look);
+        })()""")
+    projector.load_pictures(pictures)
+    projector.play()
+    held = page.evaluate("held")
+    first = [" ".join(map(str, rgb[0])) for _, rgb in pictures]
+    assert held[-1] == first[-1]
+    at = held.index(first[0])
+    assert held[at : at + 5] == first
+    rgb = pictures[-1][1]
+    assert np.array_equal(seen(page)[..., ::-1], np.broadcast_to(rgb, (SIZE[1], *rgb.shape)))
+    with pytest.raises(DeviceError):
+        projector.show(0)  # they took the place of the sequence
+    projector.load(SEQUENCE)
+    projector.show(0)
+    assert shows(page, render_pattern(SEQUENCE, 0))
+
+
 def test_a_sequence_is_sent_once_and_as_profiles(opens, channel):
     size = (912, 1140)
     opens(size)

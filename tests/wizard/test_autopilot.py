@@ -39,9 +39,11 @@ POSES = 8
 
 
 @contextmanager
-def flown(folder: Path, patterns: str, acts: list[str]) -> Iterator[Operator]:
+def flown(
+    folder: Path, patterns: str, acts: list[str], rig: dict[str, Any] = RIG
+) -> Iterator[Operator]:
     """An operator of the session in this folder, in which the autopilot has done its acts."""
-    with fit_few_cells(), Operator(folder, RIG, timing=SPARING) as operator:
+    with fit_few_cells(), Operator(folder, rig, timing=SPARING) as operator:
         operator.choose_patterns(patterns)
         Autopilot(operator, poses=POSES, patience_s=HANG_S, before=acts.append).run()
         yield operator
@@ -82,9 +84,10 @@ def test_the_flight_from_recorded_poses_reaches_a_merged_ply(
     assert "Capturing pose 7 of 8" not in acts
 
 
-def test_the_flight_reaches_a_merged_ply(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rig", [RIG, RIG | {"dlpc350": True}], ids=["", "lightcrafter"])
+def test_the_flight_reaches_a_merged_ply(tmp_path: Path, rig: dict[str, Any]) -> None:
     acts: list[str] = []
-    with flown(tmp_path / "session", "complementary", acts) as operator:
+    with flown(tmp_path / "session", "complementary", acts, rig) as operator:
         assert_all_is_measured(operator.snapshot(), acts)
     assert "Capturing pose 1 of 8" in acts
 

@@ -122,7 +122,7 @@ class RigChoice(PanelPart):
         self._presets = {
             p.name: p
             for p in presets(self._operator.session)
-            if p.choice.get("driver") != "simulated"
+            if p.choice.get("driver") != "simulated" or "dlpc350" in p.choice
         }
         options = (_CHOOSE, *SIMULATED, *self._presets, _CUSTOM)
         if tuple(self._choice.options) != options:
@@ -134,15 +134,15 @@ class RigChoice(PanelPart):
         """Return the option that gave this rig."""
         if rig.choice is None:
             return _CHOOSE
-        if rig.choice.get("driver") == "simulated":
-            scale = rig.choice.get("scale", 1.0)
-            return next((name for name, r in SIMULATED.items() if r["scale"] == scale), _CHOOSE)
         if rig.choice.get("driver") == _REPLAY:
             return _REPLAY
         for name, preset in self._presets.items():
             # apart from the delay, which is measured later
             if {**preset.choice, "settle_ms": None} == {**rig.choice, "settle_ms": None}:
                 return name
+        if rig.choice.get("driver") == "simulated":
+            scale = rig.choice.get("scale", 1.0)
+            return next((name for name, r in SIMULATED.items() if r["scale"] == scale), _CHOOSE)
         return _CUSTOM
 
     def _request_choice(self, chosen: str) -> None:
@@ -178,7 +178,8 @@ class RigChoice(PanelPart):
         for role, driver in self._drivers.items():
             choices[role] = {"driver": driver.name}
             page = self.context.page_state(role) if driver.page else None
-            if page and page.size is not None:
+            takes_size = "size" in inspect.signature(getattr(driver, role)).parameters
+            if page and page.size is not None and takes_size:
                 # saved, since the page may be opened after the session
                 choices[role]["size"] = list(page.size)
         camera, projector = self._drivers["camera"], self._drivers["projector"]
