@@ -45,7 +45,8 @@ class Camera(Protocol):
     One of more than 8 bits may also have a `full_scale`, the grey level at which it clips, such as
     4095. It can be read before the camera is open, and is stored with its captures; without it the
     bit depth is taken from the brightest pixel, and a dark image may pass for a bright one of fewer
-    bits. One that knows its focus, zoom or aperture may also have `read_lens`, as `CameraDriver`.
+    bits. One that knows its focus, zoom or aperture may also have `read_lens`, as `CameraDriver`,
+    and one whose shutter wears `preview_s`, the time between live images.
     """
 
     @property
@@ -132,6 +133,11 @@ def stated_full_scale(camera: Camera) -> int | None:
     """Return the grey level at which a camera states that it clips; None where it states none."""
     stated = getattr(camera, "full_scale", None)
     return None if stated is None else int(stated)
+
+
+def preview_interval(camera: Camera) -> float:
+    """Return the s that a camera wants between live images; 0 where it states none."""
+    return float(getattr(camera, "preview_s", 0.0))
 
 
 _MAX_ANGLE_DEG = 1e5

@@ -18,7 +18,6 @@ import numpy as np
 import viser
 
 from slviewer.calibration.next_pose import nominal_lens
-from slviewer.evaluation.render import format_counts
 from slviewer.gui.panel import NO_SESSION, ControlGroup, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.start import START, StartPanel
@@ -38,6 +37,7 @@ from slviewer.gui.widgets import (
     paragraph,
     to_html,
 )
+from slviewer.records.table import format_counts
 from slviewer.session.atomic import format_bytes
 from slviewer.session.importers.clouds import FORMATS
 from slviewer.wizard.autopilot import Autopilot

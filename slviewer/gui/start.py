@@ -92,9 +92,8 @@ class StartPanel(StepPanel):
     def draw(self) -> None:
         """Show the recent sessions, read anew after each change."""
         recent = self.context.recent
-        folders = recent.folders()[:MOST_RECENT]
+        folders, deleted = recent.read()
         self._fault.write(recent.fault, "warning")
-        deleted = recent.deleted()
         self._restore.visible = deleted is not None
         self._restore.label = f"Restore {deleted.name}" if deleted else "Restore"
         self._recent_folder.visible = bool(folders or deleted)

@@ -246,8 +246,8 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     decision, or was made elsewhere.
     """
     store, capture = job.store, settings.capture
-    if capture in store.taken_names():
-        store.load_capture(capture).require_frames("check")
+    shot = store.load_capture(capture)
+    shot.require_frames("check")
     stereo = load_stereo(store)
     if not stereo.poses:
         raise InputError(
@@ -256,7 +256,6 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
             " calibrate` first"
         )
     warn_if_stale(store, job.warn)
-    shot = store.load_capture(capture)
     job.progress(0.0, f"reading {capture}")
     look = look_at_capture(shot)
     frames, decoded = look.stack, decode_capture(shot, look)

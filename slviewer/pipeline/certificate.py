@@ -21,7 +21,6 @@ import numpy as np
 
 from slviewer import __version__
 from slviewer.errors import InputError, SlviewerError
-from slviewer.evaluation.render import format_count
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.models import available_models
@@ -38,7 +37,7 @@ from slviewer.pipeline.stored_records import (
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.kinds import RECORDS
 from slviewer.records.record import Record
-from slviewer.records.table import Column, Rows, Table
+from slviewer.records.table import Column, Rows, Table, format_count
 from slviewer.report.page import CERTIFICATE, Section, page_digest, split_page
 from slviewer.session.atomic import to_json
 from slviewer.session.capture import Capture

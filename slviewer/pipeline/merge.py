@@ -48,7 +48,7 @@ from slviewer.registration.markers import (
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.refusal import Refused
-from slviewer.registration.start import Candidate, TurntableAxis, fit_picked_start, shortest_turn
+from slviewer.registration.start import Candidate, fit_picked_start, shortest_turn
 from slviewer.registration.static_scene import ObjectAlignment, register_object
 from slviewer.session.ply import write_ply
 from slviewer.session.scan_edits import restriction_inputs
@@ -114,14 +114,12 @@ class MergeSettings:
             the session's.
         accept_rejected: Use the calibration although its verdict rejects it.
 
-    Python alone: ``axis`` of the turntable, estimated where it is not given; ``poses`` (4, 4) by
-    name, the initial alignment with "identity"; ``picked``, for a pair (scan, onto), three or more
-    points (n, 3) mm on either, in their cameras' frames, that these pairs start from. The static
-    background is separated from the moving object and excluded from the surface, unless
-    ``keep_background``.
+    Python alone: ``picked``, for a pair (scan, onto), three or more points (n, 3) mm on either, in
+    their cameras' frames, that these pairs start from. The static background is separated from the
+    moving object and excluded from the surface.
     """
 
-    UNRECORDED: ClassVar = ("out", "axis", "poses", "picked")
+    UNRECORDED: ClassVar = ("out", "picked")
     captures: Sequence[str]
     reference: str
     out: Path | str | None = None
@@ -130,10 +128,7 @@ class MergeSettings:
     angle: float | None = None
     roi: str = ""
     accept_rejected: bool = False
-    axis: TurntableAxis | None = None
-    poses: Mapping[str, np.ndarray] | None = None
     picked: Picked | None = None
-    keep_background: bool = False
 
     def __post_init__(self) -> None:
         if len(self.names) < 2:
@@ -202,10 +197,10 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     registered = register_object(
         clouds, settings.reference, starts, stage(job.progress, 0.4, 0.75, "registering")
     )
-    alignment, background = registered.alignment, settings.keep_background
-    for why in _list_warnings(clouds, registered, background):
+    alignment = registered.alignment
+    for why in _list_warnings(clouds, registered):
         warn(why)
-    clouds = clouds if background else dict(registered.clouds)
+    clouds = dict(registered.clouds)
     progress = stage(job.progress, 0.75, 0.9, "fusing")
     fused = fuse(clouds, alignment.T_reference_scan, progress, alignment.uncertainties)
     job.progress(0.9, "writing")
@@ -299,9 +294,7 @@ def _is_mat(
     return bool(compared)
 
 
-def _list_warnings(
-    clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool
-) -> Iterator[str]:
+def _list_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment) -> Iterator[str]:
     """Yield warnings of markers that have moved, of pairs that were dropped, and of points that are
     not the object, or contradict another scan, with the remedy."""
     for (a, b), pose in registered.alignment.markers.items():
@@ -317,10 +310,9 @@ def _list_warnings(
     if still := {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}:
         total = sum(int(clouds[name].mask.sum()) for name in still)
         counts = ", ".join(f"{count} of {name}" for name, count in still.items())
-        where = "in the merge once for each scan" if keep_background else "not part of the merge"
         yield (
             f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while"
-            f" the object moves: they are {where}"
+            " the object moves: they are not part of the merge"
         )
     for (one, other), contradiction in registered.contradictions.items():
         if contradiction.share > MAX_CONTRADICTION_SHARE:
@@ -409,7 +401,7 @@ def _initial_alignments(
 ) -> Starts:
     """Return the initial alignments for the requested start; raises for options that do not fit
     it."""
-    names, poses = settings.names, settings.poses
+    names, poses = settings.names, None
     if settings.start == "placed":
         placed = load_placements(job.store)
         if missing := [name for name in names if name not in placed]:
@@ -418,7 +410,7 @@ def _initial_alignments(
                 " features"
             )
         poses = {name: np.array(placed[name].T_first_scan) for name in names}
-    elif settings.start == "identity" and poses is None:
+    elif settings.start == "identity":
         poses = dict.fromkeys(names, np.eye(4))
     picks = {}
     for (scan, onto), (pick, apart) in settings.fit_picks().items():
@@ -431,7 +423,7 @@ def _initial_alignments(
         others = [name for name in names if name != base]
         if all((name, base) in picks for name in others):
             poses = {base: np.eye(4)} | {name: picks[name, base].T for name in others}
-    return Starts(poses, settings.start == "placed", table_deg, settings.axis, picks)
+    return Starts(poses, settings.start == "placed", table_deg, picks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from slviewer.calibration.splined.adjust import pose_residuals
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.errors import DamagedError, InputError, SlviewerError
-from slviewer.evaluation.render import format_count, render
+from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
@@ -57,6 +57,7 @@ from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Merge
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.record import Record
+from slviewer.records.table import format_count
 from slviewer.records.verification import Verification
 from slviewer.report.maps import PixelCurve, verification_maps
 from slviewer.report.page import Figure, write_page

@@ -9,7 +9,7 @@ import msgspec
 
 from slviewer.records.acceptance import MARKS, Decision, worst_decision
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Row, Table
+from slviewer.records.table import Cell, Column, Row, Table, format_count
 
 RULE = (
     "Decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty"
@@ -112,7 +112,7 @@ class Inspection(Record, frozen=True, kw_only=True):
             if names := [each.part for each in self.parts if each.decision == decision]:
                 listed.append(f"{len(names)} {decision} ({', '.join(names)})")
         count = len(self.parts)
-        return f"{', '.join(listed)} of {count} part{'s' * (count > 1)}" if listed else ""
+        return f"{', '.join(listed)} of {format_count(count, 'part')}" if listed else ""
 
     @property
     def is_good(self) -> bool:

@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -247,6 +248,18 @@ def format_signed(value: float, unit: str = "", digits: int = 0) -> str:
 def format_scale(factor: float) -> str:
     """Return by how much a correction of scale lengthens, such as ``+300 ppm``."""
     return format_signed(1e6 * (factor - 1), "ppm")
+
+
+def format_count(count: int, noun: str) -> str:
+    """Format a count and its noun, in the plural unless the count is 1."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def format_counts(purposes: Iterable[str]) -> str:
+    """Format how many captures there are of each purpose: "8 poses, 3 scans, 1 plane"; planes and
+    spheres only where there are any."""
+    n = {"pose": 0, "scan": 0, **Counter(purposes)}
+    return ", ".join(format_count(count, purpose) for purpose, count in n.items())
 
 
 def render_text(table: Table) -> str:

@@ -56,16 +56,15 @@ class Starts:
     """Initial alignments of a multiway registration; by features where nothing is given.
 
     ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame; ``is_decided``: they
-    follow from registrations. ``table_deg``: the
-    angle of a turntable by name, of some of the scans at least; ``axis``: its axis, None to
-    estimate it from the first pairs. ``picked``: initial poses from picked points, by pair.
-    ``markers``: coded markers by name, which give initial poses and constrain the registration.
+    follow from registrations. ``table_deg``: the angle of a turntable by name, of some of the scans
+    at least; its axis is estimated from the first pairs. ``picked``: initial poses from picked
+    points, by pair. ``markers``: coded markers by name, which give initial poses and constrain the
+    registration.
     """
 
     poses: Mapping[str, Floats] | None = None
     is_decided: bool = False
     table_deg: Mapping[str, float] | None = None
-    axis: TurntableAxis | None = None
     picked: Mapping[Pair, Candidate] | None = None
     markers: Mapping[str, MeasuredMarkers] | None = None
 
@@ -202,10 +201,8 @@ class _PoseGraphBuilder:
         if not table_deg:
             return {}
         angles = {name: table_deg[name] for name in self.names if name in table_deg}
-        axis = self.starts.axis or self._estimate_axis(angles)
-        decided = self.starts.axis is None and all(
-            result.rival_mm is None for result in self.registered.values()
-        )
+        axis = self._estimate_axis(angles)
+        decided = all(result.rival_mm is None for result in self.registered.values())
         return {
             name: Candidate(axis.rotation(-deg), "turntable", is_decided=decided)
             for name, deg in angles.items()
@@ -233,7 +230,7 @@ class _PoseGraphBuilder:
             raise Refused(
                 "overlap",
                 "No two scans in a row register, so that the turntable's axis cannot be found: "
-                "give the axis, or scan at smaller steps.",
+                "scan at smaller steps.",
             )
         return fit_turntable_axis(steps, steps_deg)
 

@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
-from slviewer.evaluation.render import format_count
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
 from slviewer.records.acceptance import MARKS, AcceptanceTest, Decision, worst_decision
@@ -23,7 +22,7 @@ from slviewer.records.merge import Merge
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.record import Record
-from slviewer.records.table import Cell, Column, Mark, Table, Value, relabel
+from slviewer.records.table import Cell, Column, Mark, Table, Value, format_count, relabel
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, average
 from slviewer.report.canvas import (

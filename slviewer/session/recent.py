@@ -61,9 +61,12 @@ class RecentSessions:
         self._file, self._listed = file, _Listed()
         self.fault = ""
 
-    def folders(self) -> list[Path]:
-        """Return the folders of the sessions that still exist."""
-        return [path for path in map(Path, self._read().sessions) if is_session(path)]
+    def read(self) -> tuple[list[Path], Path | None]:
+        """Return the folders of the sessions that still exist, at most `MOST_RECENT`, and of the
+        session that was deleted last, None where none can be restored."""
+        listed = self._read()
+        deleted, _ = next(_restorable(listed), (None, None))
+        return [*filter(is_session, map(Path, listed.sessions))][:MOST_RECENT], deleted
 
     def add(self, folder: Path) -> None:
         """Remember that a session was opened."""
@@ -84,15 +87,10 @@ class RecentSessions:
         self._write(listed)
         return place
 
-    def deleted(self) -> Path | None:
-        """Return the folder of the session that was deleted last; None where none can be
-        restored."""
-        return next((folder for folder, _ in self._restorable()), None)
-
     def restore(self) -> Path:
         """Bring the session that was deleted last back; returns its folder. Raises InputError
         without one, SessionError where its place is taken."""
-        folder, place = next(self._restorable(), (None, None))
+        folder, place = next(_restorable(self._read()), (None, None))
         if folder is None or place is None:
             raise InputError("no deleted session can be restored")
         if folder.exists():
@@ -100,12 +98,6 @@ class RecentSessions:
         atomic.move(place, folder)
         self.add(folder)
         return folder
-
-    def _restorable(self) -> Iterator[tuple[Path, Path]]:
-        """Yield (folder, place in the trash) of the deleted sessions that are still there."""
-        for folder, place in self._read().deleted:
-            if is_session(place):
-                yield Path(folder), Path(place)
 
     def _read(self) -> _Listed:
         """Return the content of the file: nothing where it is missing, or damaged, which is a
@@ -128,3 +120,10 @@ class RecentSessions:
                 atomic.replace_file(self._file, atomic.to_json(msgspec.to_builtins(listed)))
             except SessionError as error:
                 self.fault = f"The list of recent sessions, {self._file}, is not saved: {error}"
+
+
+def _restorable(listed: _Listed) -> Iterator[tuple[Path, Path]]:
+    """Yield (folder, place in the trash) of the deleted sessions that are still there."""
+    for folder, place in listed.deleted:
+        if is_session(place):
+            yield Path(folder), Path(place)

@@ -23,6 +23,7 @@ from slviewer.devices.protocols import (
     Rig,
     list_changed_settings,
     list_notes,
+    preview_interval,
     stated_full_scale,
 )
 from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableError
@@ -219,7 +220,7 @@ class Acquisition(Service):
         """Set exposure and gain before the next frame; the view then has what the camera really
         uses."""
         with self._condition:
-            self._settings = settings
+            self._settings, self._next_preview = settings, 0.0
             self._condition.notify_all()
 
     def set_delay(self, settle_ms: float) -> None:
@@ -235,6 +236,7 @@ class Acquisition(Service):
         """Show one of LIGHTS between captures, or the first frame of `pattern`."""
         with self._condition:
             self._light = (light, None if light in LIGHTS else pattern)
+            self._next_preview = 0.0
             self._condition.notify_all()
         self._change_view(light=light)
 
@@ -372,7 +374,8 @@ class Acquisition(Service):
                 elif stream:
                     self._serve_stream(rig, stream)
                 elif self._clock() >= self._next_preview:
-                    self._next_preview = self._clock() + 1 / self._timing.previews_per_s
+                    least_s = 1 / self._timing.previews_per_s
+                    self._next_preview = self._clock() + max(least_s, preview_interval(rig.camera))
                     self._grab_preview(rig)
             except Exception as error:
                 self._handle_fault(error)

@@ -11,7 +11,6 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.rules import FEW_POSES
 from slviewer.errors import Cancelled, InputError, SlviewerError
-from slviewer.evaluation.render import format_count
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.accept import ValidateSettings, validate
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
@@ -52,6 +51,7 @@ from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.table import format_count
 from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan

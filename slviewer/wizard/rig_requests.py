@@ -13,7 +13,6 @@ from slviewer.devices.capture import check_exposures
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import DamagedError, DeviceError, InputError, SlviewerError
-from slviewer.evaluation.render import format_count
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture import choose_sequence, depth_axis
@@ -23,6 +22,7 @@ from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.rig_choice import Choice, RigSetup, save_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, ExposureSuggestion, suggest_exposure
 from slviewer.preflight.check_rig import preflight
+from slviewer.records.table import format_count
 from slviewer.session.reading import expand_user
 from slviewer.session.recent import unused_folder
 from slviewer.session.store import Session

@@ -7,10 +7,10 @@ from datetime import datetime
 from pathlib import Path
 
 from slviewer.errors import SlviewerError
-from slviewer.evaluation.render import format_count, format_counts
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.models import available_models
 from slviewer.records.measurement import Measurement
+from slviewer.records.table import format_count, format_counts
 from slviewer.records.verdict import Level
 from slviewer.session.store import Session
 from slviewer.wizard.result_views import make_thumbnail

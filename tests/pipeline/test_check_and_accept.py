@@ -198,5 +198,9 @@ def test_check_answers_and_remembers(calibrated: Path) -> None:
 
 
 def test_a_calibration_from_elsewhere_has_no_floor(bare):
+    sequence = one_axis(p18((912, 1140)), "x")
+    with Session.open(bare, write=True) as store:
+        dark = np.zeros((len(sequence.frames), 4, 6), np.uint8)
+        store.save_capture("bar_0", "scan", sequence, dark, source="simulated")
     with raises(InputError, "elsewhere"):
         check(bare, "bar_0")

@@ -22,12 +22,12 @@ def test_recent_sessions_exist_and_the_last_is_first(tmp_path: Path, folders: li
     one, two, three = folders
     file = tmp_path / "state" / "recent.json"
     recent = RecentSessions(file)
-    assert recent.folders() == [] and recent.fault == ""
+    assert recent.read()[0] == [] and recent.fault == ""
     for folder in (one, two, tmp_path / "never made", one, three):
         recent.add(folder)
-    assert RecentSessions(file).folders() == [three, one, two]
+    assert RecentSessions(file).read()[0] == [three, one, two]
     two.rename(two.with_name("moved"))
-    assert recent.folders() == [three, one]
+    assert recent.read()[0] == [three, one]
 
 
 def test_damaged_list_is_ignored_and_reported(tmp_path: Path, folders: list[Path]) -> None:
@@ -35,9 +35,9 @@ def test_damaged_list_is_ignored_and_reported(tmp_path: Path, folders: list[Path
     for content in ("{", '{"sessions": 3}', '["x"]'):
         file.write_text(content)
         recent = RecentSessions(file)
-        assert recent.folders() == [] and str(file) in recent.fault
+        assert recent.read()[0] == [] and str(file) in recent.fault
         recent.add(folders[0])
-        assert recent.folders() == folders[:1] and recent.fault == ""
+        assert recent.read()[0] == folders[:1] and recent.fault == ""
 
 
 def test_unwritable_list_is_reported(tmp_path: Path, folders: list[Path]) -> None:
@@ -56,16 +56,16 @@ def test_deleted_session_moves_to_trash_and_comes_back(tmp_path: Path, folders: 
         recent.add(folder)
     with Session.open(one, write=True), pytest.raises(SessionError, match="open for writing"):
         recent.trash(one)
-    assert one.is_dir() and recent.deleted() is None
+    assert one.is_dir() and recent.read()[1] is None
     place = recent.trash(one)
     recent.trash(two)
     assert place.parent == one.parent / TRASH and not one.exists()
-    assert one not in recent.folders() and recent.deleted() == two
-    assert recent.restore() == two and recent.deleted() == one
+    assert one not in recent.read()[0] and recent.read()[1] == two
+    assert recent.restore() == two and recent.read()[1] == one
     Session.create(one).close()
     with pytest.raises(SessionError, match="exists again"):
         recent.restore()
-    assert recent.folders()[0] == two
+    assert recent.read()[0][0] == two
 
 
 def test_new_session_folder_is_unused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

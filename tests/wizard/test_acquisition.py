@@ -114,6 +114,30 @@ def test_previews_and_captures(bench: Bench) -> None:
     bench.previews_go_on()
 
 
+def test_a_shutter_that_wears_is_spared() -> None:
+    clock = Clock()
+    bench = Bench(clock)
+    bench.rig.camera.preview_s = 10.0
+    bench.open()
+    seen = 2  # the one that opens it, and the first of the others
+    for now_s, change, more in (
+        (9.9, None, 0),
+        (10.1, None, 1),
+        (19.9, None, 0),
+        (19.9, lambda: bench.acquisition.set_light("dark"), 1),
+        (19.95, lambda: bench.acquisition.set_camera(CameraSettings(2.0)), 1),
+        (29.0, None, 0),
+    ):
+        clock.now_s, seen = now_s, seen + more
+        if change:
+            change()
+        until(lambda: len(bench.previews) >= seen)  # noqa: B023
+        reads = clock.reads
+        until(lambda: clock.reads > reads + 4)  # noqa: B023
+        assert len(bench.previews) == seen, now_s
+    bench.acquisition.close()
+
+
 def test_exposure_and_light_take_effect(bench: Bench) -> None:
     bench.open()
     bench.previews_go_on()

@@ -38,7 +38,7 @@ SIMULATED: dict[str, dict[str, Any]] = {
 _CHOOSE, _CUSTOM, _REPLAY = "Choose …", "Custom …", "replay"
 _FIRST = "opencv"
 """The most common driver: a webcam."""
-_ADDRESSES = ("source", "serial")
+_ADDRESSES = ("source", "serial", "number", "model")
 """Names of the drivers' options that choose one device among several."""
 
 
@@ -59,7 +59,7 @@ class RigChoice(PanelPart):
             cameras = _label_drivers([d for d in available() if d.camera])
             self._camera = self.choice("Camera", options=cameras)
             self._source = gui.add_text(
-                "Camera ID", "", hint="Number of a webcam, file, address, or serial number"
+                "Camera ID", "", hint="Number, file, address, serial number or model"
             )
             make_private(self._source)  # it may hold a password
             projectors = _label_drivers([d for d in available() if d.projector])
@@ -185,7 +185,7 @@ class RigChoice(PanelPart):
         camera, projector = self._drivers["camera"], self._drivers["projector"]
         option, address = _address_option(camera), self._source.value.strip()
         if option and address:
-            is_number = address.isdecimal() and option == "source"
+            is_number = address.isdecimal() and option in ("source", "number")
             choices["camera"][option] = int(address) if is_number else address
         if self._size.value.strip():
             choices["projector"]["size"] = _size(self._size.value)

@@ -16,9 +16,19 @@ from PIL import Image
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import clip_level
+from slviewer.fringe.raw_image import RAW_SUFFIXES, develop
 from slviewer.session.reading import MAX_IMAGE_BYTES, read_file, read_input
 
-IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
+IMAGE_SUFFIXES = RAW_SUFFIXES | {
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".bmp",
+    ".tif",
+    ".tiff",
+    ".pgm",
+    ".ppm",
+}
 
 Channel = Literal["red", "green", "blue", "luma", "max"]
 DEFAULT_CHANNEL: Channel = "green"
@@ -107,10 +117,13 @@ def read_frames(
 def _stated_full_scale(path: Path, stack: np.ndarray) -> int | None:
     """Return the full scale that the first of the files states; None where its format states none.
 
-    A PGM states its largest grey level, which many programs leave at 65535. A PNG may state the
-    number of significant bits: by its standard the upper ones, but programs that leave the bits at
-    the bottom write it too. The tags of a TIFF state the extremes of its own pixels.
+    A RAW file states where its sensor clips. A PGM states its largest grey level, which many
+    programs leave at 65535. A PNG may state the number of significant bits: by its standard the
+    upper ones, but programs that leave the bits at the bottom write it too. The tags of a TIFF
+    state the extremes of its own pixels.
     """
+    if is_raw(path):
+        return develop(read_file(path, MAX_IMAGE_BYTES), _short_path(path)).full_scale
     data, largest = read_file(path, MAX_IMAGE_BYTES)[:4096], int(stack.max())
     at = data.find(b"sBIT") if data.startswith(_PNG) else -1
     bits = data[at + 4] if at > 0 else 0
@@ -148,6 +161,8 @@ def read_image(path: Path) -> np.ndarray:
     data, name = read_input(path, MAX_IMAGE_BYTES, "check the file"), _short_path(path)
     if not data:
         raise InputError(f"{name} is empty: copy or record it again")
+    if is_raw(path):
+        return cv2.cvtColor(develop(data, name, MAX_PIXELS).rgb, cv2.COLOR_RGB2BGR)
     width = height = 0
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
@@ -178,6 +193,11 @@ def read_image(path: Path) -> np.ndarray:
             f"{name} has {pixels.shape[2]} channels: save frames in grey or RGB, without alpha"
         )
     return pixels
+
+
+def is_raw(path: Path) -> bool:
+    """Whether a file is a camera's RAW file, by its name."""
+    return path.suffix.lower() in RAW_SUFFIXES
 
 
 def _format_size(image: np.ndarray) -> str:

@@ -12,7 +12,13 @@ from typing import Any
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.capture import NewCapture
-from slviewer.session.importers.images import DEFAULT_CHANNEL, IMAGE_SUFFIXES, Channel, read_frames
+from slviewer.session.importers.images import (
+    DEFAULT_CHANNEL,
+    IMAGE_SUFFIXES,
+    Channel,
+    is_raw,
+    read_frames,
+)
 from slviewer.session.names import join_names, natural_key, new_name, plain_name
 from slviewer.session.reading import expand_user
 
@@ -166,20 +172,26 @@ def has_wildcard(name: str) -> bool:
 
 
 def match_files(folder: Path, pattern: str) -> list[Path]:
-    """The images in a folder, or in the inner folder that the pattern names, whose name matches, in
-    natural order."""
+    """The images in a folder, or in the inner folder that the pattern names, whose name matches, as
+    `images_by_name`."""
     *inner, last = pattern.split("/")
     folder = folder.joinpath(*inner)
     if not folder.is_dir():
         return []
-    matches = re.compile(translate(last.replace("[", "[[]"))).match
-    return [file for file in images_by_name(folder) if matches(file.name)]
+    return images_by_name(folder, re.compile(translate(last.replace("[", "[[]"))))
 
 
-def images_by_name(folder: Path) -> list[Path]:
-    """The images of a folder in natural order of their names: 2 before 10."""
-    images = [entry for entry in visible(folder) if entry.suffix.lower() in IMAGE_SUFFIXES]
-    return sorted(images, key=lambda file: natural_key(file.name))
+def images_by_name(folder: Path, pattern: re.Pattern[str] = re.compile("")) -> list[Path]:
+    """The images of a folder whose name matches, in natural order of their names: 2 before 10. Of a
+    RAW file and an image that the camera made of it, the RAW file alone."""
+    images = [
+        entry
+        for entry in visible(folder)
+        if entry.suffix.lower() in IMAGE_SUFFIXES and pattern.match(entry.name)
+    ]
+    raw = {file.stem for file in images if is_raw(file)}
+    chosen = [file for file in images if is_raw(file) or file.stem not in raw]
+    return sorted(chosen, key=lambda file: natural_key(file.name))
 
 
 def match_images(
