@@ -54,7 +54,12 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
 
 
 def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
-    """Return whether the description leaves more than noise, in all images or in one."""
+    """Return whether the description leaves more than noise, in all images or in one, or gives
+    coordinates that fall from neighbour to neighbour where they rise over the image: aliases, which
+    fit as well where the patterns have few levels."""
+    J = evaluator.jacobian((base,))
+    if J is not None and evaluator.list_folded((base,), J):
+        return True
     residuals = evaluator.residuals(base)
     for axis in evaluator.sample.by_axis:
         m = evaluator.match(base, axis)

@@ -19,8 +19,6 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.records.verdict import Cause, Finding, Severity
 
 LINES = {"x": "columns", "y": "rows"}
-REPORTED = 0.03
-"""Variation of the brightness, from the darkest to the brightest frame, that is reported."""
 REMEDIES: dict[Cause, str] = {
     "missing-frame": "add the image, or capture again",
     "duplicate-frame": "look at this image, and capture again",
@@ -378,14 +376,14 @@ def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Fin
     gain = light.gain[used]
     span = float(gain.max() / gain.min()) - 1
     wave = float(np.sqrt(np.mean(light.wave**2)))
-    if "wave" in light.terms and wave > REPORTED / 3:
+    if "wave" in light.terms and wave > limits.REPORTED / 3:
         text = (
             f"the light varies from image row to image row by {100 * np.sqrt(2) * wave:.0f} %, in"
             f" {light.cycles:.1f} waves per image (mains flicker under a rolling shutter),"
             " which is corrected"
         )
         yield _of_light("flicker", text, used[0])
-    if "gain" in light.terms and span > REPORTED:
+    if "gain" in light.terms and span > limits.REPORTED:
         text = (
             f"the brightness varies by {100 * span:.1f} % among frames of a kind (automatic"
             " exposure, or an unsteady lamp), which is corrected"

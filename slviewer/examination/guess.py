@@ -20,7 +20,7 @@ from slviewer.examination.frame_blocks import (
     PhaseRun,
     group_frames,
 )
-from slviewer.examination.hypotheses import change_conventions
+from slviewer.examination.hypotheses import change_conventions, change_frames
 from slviewer.examination.line_sample import sample_lines
 from slviewer.examination.sample import sample_capture
 from slviewer.fringe.sequence import (
@@ -506,16 +506,12 @@ def _scale_to_projector(
         )
         findings.doubts.append((images, text))
     scale = finest / periods[-1]
-    scaled = tuple(
-        (
-            replace(f, period_px=float(f"{f.period_px * scale:.5g}"))
-            if f.kind == "phase" and f.axis == axis
-            else f
-        )
-        for f in sequence.frames
+    sequence = change_frames(
+        sequence,
+        axis,
+        lambda f: replace(f, period_px=float(f"{f.period_px * scale:.5g}")) if f.steps else f,
     )
     cell = select_axis_value(sequence.gray_cell_px, axis)
-    sequence = replace(sequence, frames=scaled)
     if cell is None:
         return sequence
     return change_conventions(sequence, axis, gray_cell_px=float(f"{cell * scale:.4g}"))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, permutations
 from typing import Any
 
@@ -180,13 +181,14 @@ def list_descriptions(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothe
     if shifts := sequence.phase_shifts(axis):
         yield from _list_phases(sequence, axis, len(shifts[-1][1]), change)
         yield from _scale_periods(sequence, axis)
-    orders = [list(range(bits))[::-1], *_transpositions(bits)] if bits > 1 else []
-    for order in orders:
-        changed = _renumber(sequence, axis, order)
-        yield replace(described(changed), cause="bit-order", axis=axis, cost=CHANGE_COST)
+    every = range(bits)
+    numbers = [{b: bits - 1 - b for b in every}, *({a: b, b: a} for a, b in combinations(every, 2))]
+    changes: list[Callable[[Frame], Frame]] = [partial(_renumber, n) for n in numbers if bits > 1]
     if sequence.find("inverse", axis):
-        inverted = _exchange_inverses(sequence, axis)
-        yield replace(described(inverted), cause="bit-order", axis=axis, cost=CHANGE_COST)
+        changes.append(_invert)
+    for change_frame in changes:
+        changed = change_frames(sequence, axis, change_frame)
+        yield replace(described(changed), cause="bit-order", axis=axis, cost=CHANGE_COST)
     for ratio in (0.5, 2.0) if bits else ():
         yield change("gray-cell", cell * ratio, gray_cell_px=cell * ratio)
     for turns in (0.25, 0.5, 0.75) if bits and shifts else ():
@@ -263,13 +265,19 @@ def scale_finest_period(sequence: PatternSequence, axis: Axis, period_px: float)
     """Return the sequence with another finest period of an axis. Raises InputError where it is
     another of the periods."""
     finest = sequence.periods_px(axis)[-1]
+    return change_frames(
+        sequence,
+        axis,
+        lambda f: replace(f, period_px=period_px) if f.period_px == finest else f,
+    )
 
-    def scale(frame: Frame) -> Frame:
-        """Return a frame of the finest period with the other one."""
-        own = frame.kind == "phase" and frame.axis == axis and frame.period_px == finest
-        return replace(frame, period_px=period_px) if own else frame
 
-    return replace(sequence, frames=tuple(map(scale, sequence.frames)))
+def change_frames(
+    sequence: PatternSequence, axis: Axis, change: Callable[[Frame], Frame]
+) -> PatternSequence:
+    """Return the sequence with each frame of an axis changed."""
+    frames = (change(frame) if frame.axis == axis else frame for frame in sequence.frames)
+    return replace(sequence, frames=tuple(frames))
 
 
 def change_conventions(sequence: PatternSequence, axis: Axis, **values: float) -> PatternSequence:
@@ -283,33 +291,12 @@ def change_conventions(sequence: PatternSequence, axis: Axis, **values: float) -
     return replace(sequence, **pairs)
 
 
-def _transpositions(bits: int) -> Iterator[list[int]]:
-    """Yield all exchanges of two bits."""
-    for a, b in combinations(range(bits), 2):
-        order = list(range(bits))
-        order[a], order[b] = b, a
-        yield order
+def _invert(frame: Frame) -> Frame:
+    """Return a Gray bit as its inverse, or the other way round."""
+    other: dict[Kind, Kind] = {"gray": "inverse", "inverse": "gray"}
+    return replace(frame, kind=other.get(frame.kind, frame.kind))
 
 
-def _exchange_inverses(sequence: PatternSequence, axis: Axis) -> PatternSequence:
-    """Return the sequence with the bits of an axis described as inverses, and these as bits."""
-    other: dict[str, Kind] = {"gray": "inverse", "inverse": "gray"}
-
-    def exchange(frame: Frame) -> Frame:
-        """Return a frame with its other kind."""
-        if frame.axis != axis or frame.kind not in other:
-            return frame
-        return replace(frame, kind=other[frame.kind])
-
-    return replace(sequence, frames=tuple(map(exchange, sequence.frames)))
-
-
-def _renumber(sequence: PatternSequence, axis: Axis, order: Sequence[int]) -> PatternSequence:
-    """Return the sequence with the bits of an axis renumbered."""
-
-    def renumber(frame: Frame) -> Frame:
-        """Return a frame with its new number."""
-        own = frame.axis == axis and frame.kind in ("gray", "inverse")
-        return replace(frame, bit=order[frame.bit]) if own else frame
-
-    return replace(sequence, frames=tuple(map(renumber, sequence.frames)))
+def _renumber(number: Mapping[int, int], frame: Frame) -> Frame:
+    """Return a frame with the other number of its bit, if it has one."""
+    return replace(frame, bit=number.get(frame.bit, frame.bit)) if frame.bits else frame

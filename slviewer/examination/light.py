@@ -95,7 +95,33 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
         own = _score(judged, base, light, first)
         if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
-    return _accept(base.sequence, stack, best, score) if best.terms else constant
+    light = _accept(base.sequence, stack, best, score) if best.terms else constant
+    drift = constant if light.terms else _extract_drift(base.sequence, gains)
+    is_better = drift.terms and np.isfinite(_score(judged, base, drift, first))
+    return drift if is_better else light
+
+
+def _extract_drift(sequence: PatternSequence, light: FrameLight) -> FrameLight:
+    """Return a light that grows or fades steadily, at the rate of the gains of another one; equal
+    light where the steps of each period do not agree about it, or it is too little to be reported.
+
+    What imitates gains depends on the pattern, and a drift of the light on time alone: the rate is
+    known better than the gains of three steps, or than those of dark frames.
+    """
+    shifts, count = list_shifts(sequence), len(light.gain)
+    constant = FrameLight.constant(count)
+    if len(shifts) < limits.FEWEST_RATES:
+        return constant
+    times = [np.array(steps) - np.mean(steps) for steps in shifts]
+    weights = [time @ time for time in times]
+    moments = [t @ np.log(light.gain[[*s]]) for t, s in zip(times, shifts, strict=True)]
+    rates = np.array(moments) / weights
+    rate = np.average(rates, weights=weights)
+    error = np.sqrt(np.average((rates - rate) ** 2, weights=weights) / (len(rates) - 1))
+    if abs(rate) < max(limits.SIGMAS * error, limits.REPORTED / count):
+        return constant
+    gain = np.exp(rate * (np.arange(count) - count / 2))
+    return replace(constant, gain=gain, terms=("gain",))
 
 
 def _start_from_means(evaluator: Evaluator, base: Hypothesis) -> FrameLight:

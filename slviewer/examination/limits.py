@@ -147,6 +147,11 @@ LEAST_GAIN, LEAST_GAIN_OF_THREE, LEAST_CODED_GAIN = 0.0075, 0.01, (0.045, 0.25)
 response and blur of a camera imitate as much; of three steps, which hardly determine it; and of
 stripes, which blur imitates and thresholds tolerate: alone, and beside fringes, which would show
 it."""
+REPORTED = 0.03
+"""Variation of the brightness, from the darkest to the brightest frame, that is reported."""
+FEWEST_RATES = 3
+"""Periods whose steps must agree about a steady change of the light: the scatter of two rates is
+not known."""
 FARTHEST_GAIN = 0.7
 """Logarithm of a gain over the median of its kind beyond which a frame shows something else."""
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03

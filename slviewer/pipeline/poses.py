@@ -37,7 +37,7 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask, detect
 
-EVIDENCE_VERSION = 7
+EVIDENCE_VERSION = 8
 """Version of the examination; evidence that was stored by another version is computed again."""
 
 

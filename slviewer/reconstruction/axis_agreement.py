@@ -102,14 +102,18 @@ class AxisAgreement:
 
     ``misfit_px``: 1.4826 times the median distance; ``predicted_px``: what noise and the
     calibration's residuals make of it (1 sigma). ``in_front``: share of the points that lie before
-    both devices; ``depths_mm``: those of these points.
+    both devices; ``depths_mm``: those of these points. ``known`` (n,) bool: the pixels that are
+    calibrated, ``distance`` and ``variance`` (m,): the signed distance of each of these, and its
+    variance by noise.
     """
 
     misfit_px: float
     predicted_px: float
     in_front: float
     depths_mm: Floats
-    pixels: int
+    known: np.ndarray
+    distance: Floats
+    variance: Floats
 
     @property
     def ratio(self) -> float:
@@ -210,11 +214,12 @@ def check_phases(
             f"{name}: {_describe_contradiction(agreement)}:"
             f" {_likely_reason(agreement, rig, pixels, measured)}"
         )
-    excess, misfit = local_misfit(calibration, pixels, measured, sigma), None
+    at = pixels[agreement.known], measured[agreement.known]
+    excess, misfit = _map_misfit(calibration, at[0], agreement), None
     if agreement.ratio > RAISED_RATIO:
         everywhere = np.sqrt(agreement.misfit_px**2 - agreement.predicted_px**2)
         excess = np.maximum(0.0 if excess is None else excess, np.full(TILES, everywhere, "f4"))
-        misfit = Misfit(excess, _bound_change(calibration, pixels, measured, sigma))
+        misfit = Misfit(excess, _bound_change(calibration, *at, agreement))
         if not agreement.is_refused:
             warnings.append(
                 f"{name}: the x and y patterns disagree by {agreement.misfit_px:.2f} px with this"
@@ -237,54 +242,44 @@ def check_phases(
 
 
 def _bound_change(
-    calibration: Calibration, pixels: Floats, measured: Floats, sigma: Floats
+    calibration: Calibration, pixels: Floats, measured: Floats, agreement: AxisAgreement
 ) -> Floats:
-    """Return what the misfit of the axes says of changes of the rig, as `bound_change`; arguments
-    as of `measure_axis_agreement`."""
+    """Return what the misfit of the axes at calibrated camera ``pixels`` (m, 2) says of changes of
+    the rig, as `bound_change`; ``measured`` (m, 2): their projector coordinates."""
     rig = calibration.pinholes
-    known, distance, noise = _misfit(rig, *calibration.undistort_pairs(pixels, measured), sigma)
-    at = pixels[known], measured[known]
     changes = differentiate(
         rig,
         lambda other: epipolar_distance(
-            other, other.camera.undistort(at[0]), other.projector.undistort(at[1])
+            other, other.camera.undistort(pixels), other.projector.undistort(measured)
         )[0],
     )
-    values = np.column_stack([distance, noise, changes])
+    values = np.column_stack([agreement.distance, agreement.variance, changes])
     values = np.column_stack([np.ones(len(values)), np.nan_to_num(values)])
-    sums = _sum_by_tile(rig, at[0], values)
+    tile = number_tiles(pixels, rig.camera.size, TILES)
+    sums = np.stack([np.bincount(tile, column) for column in values.T], axis=1)
+    sums = sums[sums[:, 0] >= LEAST_IN_TILE]
     count = sums[:, :1]
     _, means, noises, effects = np.split(sums / count, [1, 2, 3], axis=1)
     sigma_px = np.sqrt(noises / count + calibration.residual_px**2)
     return bound_change(effects, means[:, 0], sigma_px[:, 0])
 
 
-def _sum_by_tile(rig: StereoRig, pixels: Floats, values: Floats) -> np.ndarray:
-    """Return the sums (m, k) of ``values`` (n, k), the first of which are ones, over the tiles of
-    enough of the pixels (n, 2)."""
-    tile = number_tiles(pixels, rig.camera.size, TILES)
-    sums = np.stack([np.bincount(tile, column) for column in values.T], axis=1)
-    return sums[sums[:, 0] >= LEAST_IN_TILE]
-
-
-def local_misfit(
-    calibration: Calibration, pixels: Floats, measured: Floats, sigma: Floats
+def _map_misfit(
+    calibration: Calibration, pixels: Floats, agreement: AxisAgreement
 ) -> Floats32 | None:
     """Return the misfit of the axes in px of the projector for each of `TILES` of the image, beyond
     what is predicted there; 0 where noise and the calibration's residuals explain it, None where
     they do so everywhere.
 
-    ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_axis_agreement` takes them. What
-    disturbs one axis disturbs the other about as much.
+    ``pixels`` (m, 2): those that are calibrated. What disturbs one axis disturbs the other about as
+    much.
     """
-    rig = calibration.pinholes
-    known, distance, noise = _misfit(rig, *calibration.undistort_pairs(pixels, measured), sigma)
-    tile = number_tiles(pixels[known], rig.camera.size, TILES)
+    tile = number_tiles(pixels, calibration.pinholes.camera.size, TILES)
     excess = np.zeros(TILES, np.float32)
     for number in np.unique(tile):
         is_inside = tile == number
-        predicted = float(np.median(noise[is_inside])) + calibration.residual_px**2
-        misfit = robust_sigma(distance[is_inside], about=0.0) ** 2
+        predicted = float(np.median(agreement.variance[is_inside])) + calibration.residual_px**2
+        misfit = robust_sigma(agreement.distance[is_inside], about=0.0) ** 2
         enough = np.count_nonzero(is_inside) >= LEAST_IN_TILE
         if enough and misfit > RAISED_RATIO**2 * predicted:
             excess.flat[number] = np.sqrt(misfit - predicted)
@@ -300,7 +295,7 @@ def measure_axis_agreement(
     agreement = _compute_agreement(
         rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px
     )
-    return agreement if agreement.pixels >= LEAST_PIXELS else None
+    return agreement if len(agreement.distance) >= LEAST_PIXELS else None
 
 
 def epipolar_distance(rig: StereoRig, camera: Floats, projector: Floats) -> tuple[Floats, Floats]:
@@ -313,16 +308,6 @@ def epipolar_distance(rig: StereoRig, camera: Floats, projector: Floats) -> tupl
     with np.errstate(invalid="ignore", divide="ignore"):
         offset = np.einsum("ni,ni->n", line, _rays(projector))
         return offset / length, normal / length[:, None]
-
-
-def _misfit(
-    rig: StereoRig, camera: Floats, projector: Floats, sigma: Floats
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which pixels (n,) bool are calibrated, and the ``epipolar_distance`` (m,) px of these
-    and its variance (m,) by the noise ``sigma`` (n, 2) px."""
-    distance, normal = epipolar_distance(rig, camera, projector)
-    known = np.isfinite(distance)
-    return known, distance[known], np.sum((normal[known] * sigma[known]) ** 2, axis=1)
 
 
 def ray_depths(rig: StereoRig, camera: Floats, projector: Floats) -> Floats:
@@ -348,10 +333,13 @@ def _compute_agreement(
 ) -> AxisAgreement:
     """Return the axis agreement of undistorted coordinates (n, 2) with noise ``sigma`` (n, 2)
     px."""
-    known, distance, noise = _misfit(rig, camera, projector, sigma)
+    distance, normal = epipolar_distance(rig, camera, projector)
+    known = np.isfinite(distance)
+    distance = distance[known]
+    variance = np.sum((normal[known] * sigma[known]) ** 2, axis=1)
     if not known.any():
-        return AxisAgreement(np.inf, 1.0, 0.0, np.empty(0), 0)
-    predicted = float(np.sqrt(np.median(noise) + residual_px**2))
+        return AxisAgreement(np.inf, 1.0, 0.0, np.empty(0), known, distance, variance)
+    predicted = float(np.sqrt(np.median(variance) + residual_px**2))
     depths = ray_depths(rig, camera[known], projector[known])
     front = (depths > 0).all(axis=1)
     return AxisAgreement(
@@ -359,7 +347,9 @@ def _compute_agreement(
         predicted_px=max(predicted, 1e-6),
         in_front=float(front.mean()),
         depths_mm=depths[front, 0],
-        pixels=len(distance),
+        known=known,
+        distance=distance,
+        variance=variance,
     )
 
 
@@ -437,7 +427,9 @@ def _likely_reason(
             np.zeros_like(at),
             0.0,
         )
-        enough = tried.pixels > 0.5 * agreement.pixels and tried.in_front >= LEAST_IN_FRONT
+        enough = (
+            tried.known.sum() > 0.5 * agreement.known.sum() and tried.in_front >= LEAST_IN_FRONT
+        )
         if enough and tried.misfit_px < best:
             best, reason = tried.misfit_px, words
     explained = agreement.limit_px

@@ -9,7 +9,7 @@ from slviewer.examination.findings import describe_light
 from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe import decode as decoding
 from slviewer.fringe.phase import Reason
-from slviewer.fringe.presets import complementary, gray, p18
+from slviewer.fringe.presets import complementary, gray, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 
 pytestmark = pytest.mark.computes
@@ -69,6 +69,32 @@ def test_gains_are_those_that_were_applied(name):
     assert ratio.std() / ratio.mean() < 0.004
     (found,) = describe_light(sequence, light)
     assert found.cause == "exposure-drift" and not missing_facts(found.sentence, "corrected")
+
+
+BEATS = PatternSequence(
+    PROJECTOR, tuple(f for period in (16.8, 14.1, 11.7) for f in phase_steps("x", 3, period))
+)
+
+
+@pytest.mark.parametrize("change", [-0.08, 0.08])
+def test_a_small_drift_is_known_by_the_steps_of_all_periods(change):
+    gain = np.linspace(1, 1 + change, len(BEATS.frames))
+    stack = capture(BEATS, TRUTH, shot=0.01)
+    floor = rms_px(decode(BEATS, stack, "x"))
+    drifting = relit(stack, 0.9 * gain[:, None, None])
+    light = estimate_frame_light(BEATS, drifting)
+    ends = np.log(light.gain[[0, -1]])
+    assert ends[1] - ends[0] == pytest.approx(np.log(1 + change), rel=0.1)
+    assert rms_px(decoding.decode(BEATS, drifting, "x")) > 1.2 * floor
+    assert 0.8 * floor < rms_px(decode(BEATS, drifting, "x")) < 1.1 * floor
+    (found,) = describe_light(BEATS, light)
+    assert found.cause == "exposure-drift" and not missing_facts(found.sentence, "corrected")
+
+
+def test_gains_that_differ_at_random_are_no_drift():
+    gain = gains(len(BEATS.frames), 0.015, seed=3)
+    light = estimate_frame_light(BEATS, relit(capture(BEATS, TRUTH, shot=0.01), 0.9 * gain))
+    assert light.terms == ()
 
 
 @pytest.mark.parametrize("name", SEQUENCES)

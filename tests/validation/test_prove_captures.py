@@ -220,3 +220,22 @@ def test_beats_beyond_a_projector_that_is_stated_too_small_are_named() -> None:
     case = examine_case("projector too small", "micro", 1)
     assert case.outcome == "right"
     assert {named.cause for named in case.named} == {"projector-size"}
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize(
+    ("fault", "kind", "seed", "cause"),
+    [
+        # a drift of 1 % among three steps, and one that noise hides in each frame
+        ("drift of 8 %", "heterodyne", 0, "exposure-drift"),
+        ("drift of 30 %", "micro", 1, "exposure-drift"),
+        # aliases that run against the image, and fit as well
+        ("offset of half a period", "multifrequency", 0, "phase-offset"),
+    ],
+)
+def test_what_few_phase_steps_hide_is_named(
+    fault: str, kind: CaptureKind, seed: int, cause: str
+) -> None:
+    case = examine_case(fault, kind, seed)
+    assert case.outcome == "right", case.text()
+    assert {named.cause for named in case.named} == {cause}
