@@ -217,7 +217,7 @@ def stand_in_for_rawpy() -> ModuleType:
             self.mosaic, self.sizes = pixels, SimpleNamespace(raw_width=width, raw_height=height)
             self.white_level, self.camera_white_level_per_channel = WHITE, None
             self.black_level_per_channel = [BLACK] * 4
-            self.other = SimpleNamespace(focal_length=35.0, aperture=5.6)
+            self.other = SimpleNamespace(focal_length=35.0)
 
         def __enter__(self) -> "Raw":
             return self
