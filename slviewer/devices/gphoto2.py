@@ -39,18 +39,18 @@ _REQUIRED = (
     ("focus mode", ("focusmode",), "manual|mf.*", "set its lens to MF, and focus by hand"),
     ("automatic ISO", ("autoiso",), "off", "switch it off in its menu"),
     ("image quality", ("imageformat", "imagequality"), r"c?raw|nef \(raw\)", "set it to RAW alone"),
-    ("capture target", ("capturetarget",), "internal ram|sdram", "take its card out"),
+    ("capture target", ("capturetarget",), "internal ram|sdram", ""),  # a card is slower
 )
-"""What must be so that frames compare: words for it, its names, the choices that are right, and
-what the operator does where it cannot be set."""
+"""Settings with which frames can be compared: words, names, choices that are right, and the remedy
+where the camera does not take one; "" where it may refuse."""
 
 _REMEDIES = {
-    _BUSY: "set its lens to MF, as a focus that it does not find blocks the shutter, and wait until"
-    " it has stored its pictures",
-    -115: "its memory is full: take its card out, or empty it",
+    _BUSY: "set its lens to MF, as the shutter waits for the focus, and wait until its pictures are"
+    " stored",
+    -115: "its memory is full: empty its card, or take it out",
     -105: "plug it in, and switch it on",
-    -53: "close what else uses it, such as photo programs and file managers (on GNOME, gio mount -s"
-    " gphoto2 makes them let go)",
+    -53: "close what else uses it, such as photo programs and file managers (on GNOME, run gio"
+    " mount -s gphoto2)",
     -52: "plug it in, and switch it on",
 }
 """By the errors of gphoto2-result.h and gphoto2-port-result.h."""
@@ -66,7 +66,7 @@ def _as_device_error(name: str) -> Iterator[None]:
     except gphoto2.GPhoto2Error as error:
         remedy = _REMEDIES.get(
             error.code,
-            "switch it off and on, check its cable and its battery, and let it not sleep",
+            "switch it off and on, check its cable and battery, and disable its power saving",
         )
         raise DeviceError(f"{name} does not answer ({error}): {remedy}") from error
 
@@ -94,19 +94,19 @@ class _Link:
             self._names = {listed.get_name(k) for k in range(listed.count())}
 
     def close(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
         with contextlib.suppress(Exception):
             self._camera.exit()
 
     def prepare(self) -> None:
-        """Bring all that is in `_REQUIRED` about. Raises DeviceError where the camera refuses."""
+        """Set what `_REQUIRED` lists. Raises DeviceError where the camera refuses."""
         for what, names, right, remedy in _REQUIRED:
             fits = re.compile(right, re.IGNORECASE).fullmatch
             widget = self._find(names)
             if widget is None or fits(value := widget.get_value()):
                 continue
             choice = next(filter(fits, self._list_choices(widget)), None)
-            if choice is None or not self._set(widget, choice):
+            if (choice is None or not self._set(widget, choice)) and remedy:
                 raise DeviceError(f"the {what} of {self._name} is {value!r}: {remedy}")
 
     def read_number(self, names: tuple[str, ...]) -> float | None:
@@ -162,18 +162,18 @@ class _Link:
             raise DeviceError(f"{self._name} sent a damaged picture, {error}") from error
 
     def _find(self, names: tuple[str, ...]) -> Any:
-        """Return the first setting of these names that the camera has, or None."""
+        """Return the widget of the first of these names that the camera has; None without any."""
         name = next((name for name in names if name in self._names), None)
         with _as_device_error(self._name):
             return None if name is None else self._camera.get_single_config(name)
 
     def _list_choices(self, widget: Any) -> list[str]:
-        """Return what may be chosen of a setting; nothing where it can only be read."""
+        """Return the choices of a setting; none where it can only be read."""
         with _as_device_error(self._name):
             return [] if widget.get_readonly() else list(widget.get_choices())
 
     def _set(self, widget: Any, choice: str) -> bool:
-        """Set a choice; returns whether the camera has it then."""
+        """Set a choice; returns whether the camera reports it afterwards."""
         import gphoto2
 
         with contextlib.suppress(gphoto2.GPhoto2Error):  # what it has then is read
@@ -185,7 +185,8 @@ class _Link:
 
 @cache
 def _take_first(name: str, port: str) -> tuple[tuple[int, int], int]:
-    """Take one picture, for the size (width, height) px and full scale of all."""
+    """Take a picture, and return its size (width, height) px and full scale, which are those of
+    all."""
     link = _Link(name, port)
     try:
         link.prepare()
@@ -247,7 +248,7 @@ class DslrCamera(CameraDriver):
             )
 
     def close(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
         super().close()
         link, self._link = self._link, None
         if link:

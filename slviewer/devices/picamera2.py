@@ -29,8 +29,8 @@ from slviewer.errors import DeviceError, InputError
 
 _ANSWER_S = 3.0
 _MOST_FRAMES = 20
-"""That begin before a call, or until settings are those of a frame: more than are in the queues of
-sensor, driver and library together."""
+"""Frames that began before a call, or have the previous settings; fewer are queued by sensor,
+driver and library."""
 _SHIFTED_FULL_SCALE = 0xFFC0  # a Raspberry Pi 5 moves the sensor's 10 or 12 bits to the top of 16
 _FIXED = {"AeEnable": False, "AwbEnable": False, "AfMode": 0}
 _CHECK = (
@@ -62,7 +62,7 @@ def _open_camera(number: int, size: tuple[int, int] | None) -> tuple[Any, dict[s
             camera.create_still_configuration(
                 main={"size": (640, 480)},
                 raw={"format": unpacked, "size": tuple(wanted)},
-                buffer_count=2,  # with one, every second frame is lost
+                buffer_count=2,  # with one, frames are dropped
                 queue=False,
             )
         )

@@ -17,13 +17,12 @@ RAW_SUFFIXES = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class RawImage:
-    """(h, w, 3) uint16 RGB, the level at which its sensor clips, and focal length in mm and
-    f-number of the lens, 0 where the file does not state them."""
+    """(h, w, 3) uint16 RGB, the level at which its sensor clips, and the focal length of the lens
+    in mm, 0 where the file does not state it."""
 
     rgb: np.ndarray
     full_scale: int
     focal_mm: float
-    aperture: float
 
 
 def develop(data: bytes, name: str, most_pixels: int = 2**28) -> RawImage:
@@ -56,8 +55,7 @@ def develop(data: bytes, name: str, most_pixels: int = 2**28) -> RawImage:
             )
             whites = [raw.white_level, *(raw.camera_white_level_per_channel or ())]
             full_scale = min(filter(None, whites)) - max(raw.black_level_per_channel)
-            shot = getattr(raw, "other", None)  # since rawpy 0.25
-            lens = (shot.focal_length, shot.aperture) if shot else (0.0, 0.0)
+            focal_mm = getattr(getattr(raw, "other", None), "focal_length", 0.0)  # of newer ones
     except InputError:
         raise
     except Exception as error:  # a file from anywhere may make its reader fail in any way
@@ -69,4 +67,4 @@ def develop(data: bytes, name: str, most_pixels: int = 2**28) -> RawImage:
         ) from error
     if rgb.ndim == 2 or rgb.shape[2] == 1:
         rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)
-    return RawImage(rgb, int(full_scale), *map(float, lens))
+    return RawImage(rgb, int(full_scale), float(focal_mm))
