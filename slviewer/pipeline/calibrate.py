@@ -184,13 +184,11 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
         part(job.progress, 0, 0.65),
         camera,
     )
-    if first.second is not None:  # which takes the projector's place
-        diagnosed = replace(diagnosed, verdict=diagnosed.verdict.rename(_OF_PAIR))
+    diagnosed = replace(diagnosed, verdict=_name_devices(diagnosed.verdict, first))
     if diagnosed.stereo is None:
         save_verdict(store, diagnosed.verdict, names)
     result = _fit_models(diagnosed, settings, part(job.progress, 0.66, 0.97), job.warn, excluded)
-    if first.second is not None:
-        result = replace(result, verdict=result.verdict.rename(_OF_PAIR))
+    result = replace(result, verdict=_name_devices(result.verdict, first))
     job.progress(0.97, "saving")
     inputs = store.input_hashes(*result.stereo.poses, *([LENS] if camera else []))
     used = replace(settings, camera=LENS if camera else None)  # the session's own copy
@@ -213,6 +211,11 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
         raise rejection_error(result.verdict, is_saved=True)
     warn_if_frame_changed(store, before, job.warn)
     job.progress(1.0, "calibrated")
+
+
+def _name_devices(verdict: Verdict, pose: Capture) -> Verdict:
+    """Return the verdict with the second camera named where it takes the projector's place."""
+    return verdict if pose.second is None else verdict.rename(_OF_PAIR)
 
 
 def calibrate_frames(

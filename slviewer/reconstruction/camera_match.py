@@ -12,7 +12,7 @@ calibrated pair has.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -90,25 +90,27 @@ def match_cameras(
         apart = np.abs(calibration.pinholes.t)
         kept = ["x" if apart[0] >= apart[1] else "y"]
     found = _find(*(np.stack(maps, axis=-1, dtype=np.float64) for maps in (*numbers, *sigmas)))
-    base = known[0][0]
-    reason = base.reason.copy()
-    for phase, _ in known[1:]:
+    own = [phase for phase, _ in known]
+    return {axis: _as_phase(axis, own, found) for axis in kept}
+
+
+def _as_phase(axis: Axis, own: Sequence[PhaseMap], found: np.ndarray) -> PhaseMap:
+    """Return what `_find` found along one axis as a phase map of the first camera, whose ``own``
+    phases say what is masked besides."""
+    reason = own[0].reason
+    for phase in own[1:]:
         reason = np.where(reason == Reason.VALID, phase.reason, reason)
-    reason = np.where(
-        (reason == Reason.VALID) & np.isnan(found[..., 0]), np.uint8(Reason.UNSEEN), reason
+    unseen = (reason == Reason.VALID) & np.isnan(found[..., 0])
+    reason = np.where(unseen, np.uint8(Reason.UNSEEN), reason)
+    k = 0 if axis == "x" else 1
+    coordinate, sigma = (
+        np.where(reason == Reason.VALID, found[..., i], np.nan).astype(np.float32)
+        for i in (k, 2 + k)
     )
-    valid = reason == Reason.VALID
-    matched = dict[Axis, PhaseMap]()
-    for axis in kept:
-        k = 0 if axis == "x" else 1
-        coordinate, sigma = (
-            np.where(valid, found[..., i], np.nan).astype(np.float32) for i in (k, 2 + k)
-        )
-        matched[axis] = replace(
-            base, axis=axis, period_px=2 * np.pi, phase=coordinate, reason=reason, steps=0,
-            unambiguous_px=np.inf, model_error_rad=0.0, sigma_scale=1.0, sigma_known=sigma,
-        )  # fmt: skip
-    return matched
+    return replace(
+        own[0], axis=axis, period_px=2 * np.pi, phase=coordinate, reason=reason, steps=0,
+        unambiguous_px=np.inf, model_error_rad=0.0, sigma_scale=1.0, sigma_known=sigma,
+    )  # fmt: skip
 
 
 def rectified_rows(calibration: PairCalibration) -> tuple[np.ndarray, np.ndarray]:

@@ -94,7 +94,7 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
         progress, cases, 0.6, 1.0
     ):
         models = {"stereo": stereo, "splined": splined, FLOOR: PerfectModel(true)}
-        row = measure(models, covered_pixels(seen), plan, partial(scan, actual), report)
+        row = measure_shapes(models, covered_pixels(seen), plan, partial(scan, actual), report)
         rows.append({"rig": name, **row})
         ratio, spacing = row["splined / floor"], row["worst spacing mm"]
         if name != "one camera, projector turned":
@@ -120,7 +120,7 @@ def seen_by_both(
     return decode_frames("first", sequence, first), decode_frames("second", sequence, other)
 
 
-def measure(
+def measure_shapes(
     models: Mapping[str, Model],
     covered: np.ndarray,
     plan: Mapping[str, Scene],

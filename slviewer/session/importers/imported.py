@@ -319,41 +319,38 @@ def pair_cameras(imports: Imports) -> Imports:
     """Join the captures of two cameras, if that is what all captures of a source are: those of the
     first have a name with left, L, cam0 or camera0 in it, of the folder or of every file, and each
     of their files has a namesake with right, R, cam1 or camera1."""
-    every = {file for recording in imports.recordings for file in recording.files}
-    pairs, of_second = list[ImportableRecording](), set[Path]()
-    for recording in imports.recordings:
-        for is_first, second in _CAMERAS:
-            files = [_name_alike(file, is_first, second) for file in recording.files]
-            if not files or not all(file.is_file() for file in files):
-                continue
-            name = is_first.sub("", recording.name).strip("_- ") or recording.source.parent.name
-            other = replace(recording, files=tuple(files), source=files[0].parent)
-            pairs.append(replace(recording, name=plain_name(name, "capture"), second=other))
-            of_second.update(files)
-            break
+    pairs = [pair for each in imports.recordings if (pair := _find_pair(each))]
+    of_second = {file for pair in pairs if pair.second for file in pair.second.files}
     own = {file for pair in pairs for file in pair.files}
-    if not pairs or every - own - of_second:
+    if not pairs or any(own.union(of_second).isdisjoint(each.files) for each in imports.recordings):
         return imports
     text = f"{join_names([pair.name for pair in pairs], 3)}: taken by two cameras, by their names"
     told = [each for each in imports.warnings if not any(f.name in each for f in of_second)]
     return replace(imports, recordings=pairs, warnings=[*told, text])
 
 
+def _find_pair(recording: ImportableRecording) -> ImportableRecording | None:
+    """Return a recording of the first camera with that of the second; None for others."""
+    for is_first, second in _CAMERAS:
+        files = tuple(_name_alike(file, is_first, second) for file in recording.files)
+        if files and all(file.is_file() for file in files):
+            name = is_first.sub("", recording.name).strip("_- ") or recording.source.parent.name
+            other = replace(recording, files=files, source=files[0].parent)
+            return replace(recording, name=plain_name(name, "capture"), second=other)
+    return None
+
+
 def _name_alike(file: Path, is_first: re.Pattern[str], second: str) -> Path:
-    """Return where the second camera's image of a file of the first would be: the last of file and
-    folder that names a camera names the other one. A file without a camera's name is its own."""
+    """Return where the second camera's image of a file of the first is: the name of the file, else
+    of its folder, names the other camera in the same case. The folder of a file without one."""
     for part in (file, file.parent):
-        found = is_first.search(part.name)
-        if found:
+        if found := is_first.search(part.name):
             written = second.upper() if found[0].isupper() else second
-            written = written.capitalize() if found[0].istitle() and len(second) > 1 else written
+            if found[0].istitle() and len(second) > 1:
+                written = second.capitalize()
             name = part.name[: found.start()] + written + part.name[found.end() :]
-            return (
-                part.with_name(name) / file.relative_to(part)
-                if part != file
-                else (file.with_name(name))
-            )
-    return file.parent / ""
+            return part.parent.joinpath(name, *file.relative_to(part).parts)
+    return file.parent
 
 
 def none_usable(skipped: Sequence[Skipped]) -> InputError:
