@@ -306,7 +306,8 @@ class LightCrafter4500(Openable):
         self._send(control, is_burst=True)
         count, n = timing.count, len(pictures)
         most = (n + 2 + 2 * _LEAD + _SPARE) * count
-        return PatternBurst(places, count, n * count, timing.period_us / 1000, most)
+        seconds = (n + 2) / timing.refresh_hz
+        return PatternBurst(places, count, n * count, timing.period_us / 1000, seconds, most)
 
     def run(self) -> None:
         """Show what was prepared once."""

@@ -23,7 +23,7 @@ from slviewer.devices.lightcrafter4500 import (
     PatternTiming,
     list_lightcrafters,
 )
-from slviewer.devices.protocols import Rig
+from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import SimulatedProjector
 from slviewer.devices.simulated_dlpc350 import (
     SimulatedDlpc350,
@@ -377,6 +377,24 @@ def test_the_terminal_scans_verifies_and_merges_with_bursts(recorded, tmp_path, 
     merge = ("merge", session, "ball_2", "--reference", "ball_1", "--start", "identity")
     status, _, error = run(*merge)
     assert status == 0, error
+
+
+@pytest.mark.parametrize(
+    ("settings", "seconds"), [((8,), 0.25), ((7,), 0.183), ((8, 1, 8333), 0.45)]
+)
+def test_a_burst_lasts_as_long_as_its_pictures(world, settings, seconds):
+    rig, _ = simulated_lightcrafter(world, PatternTiming(*settings))
+    assert isinstance(rig.projector, LightCrafter4500)
+    with rig.opened():
+        rig.projector.load(PatternSequence(SIZE, p18(SIZE).frames[:25]))
+        assert rig.projector.prepare().seconds == pytest.approx(seconds, abs=1e-3)
+
+
+def test_an_exposure_longer_than_a_pattern_is_refused(lightcrafter):
+    rig, _ = lightcrafter
+    rig.camera.apply(CameraSettings(exposure_ms=9.0))
+    with raises(DeviceError, 9, 8.333, "exposure"):
+        capture_frames(rig, SHORT)
 
 
 def test_a_rig_file_chooses_the_driver_and_its_settings(monkeypatch):
