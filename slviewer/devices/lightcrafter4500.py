@@ -249,8 +249,8 @@ class LightCrafter4500(Openable):
         self._is_stepping = False
         self._pictures.open()
         control.set(Command.POWER, 0)
-        control.set(Command.FREEZE, 0)
-        if faults := control.list_faults():
+        control.write(Command.FREEZE, b"\0")
+        if faults := control.list_faults(is_running=False):
             raise DeviceError(f"{self.name} {'; it '.join(faults)}")
         control.write(Command.SOURCE, bytes([_PARALLEL_24_BIT]))
         if (currents := self._timing.led_currents) is not None:
