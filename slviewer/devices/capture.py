@@ -119,6 +119,13 @@ def _capture_burst(rig: Rig, out: np.ndarray) -> None:
     assert isinstance(camera, TriggeredCamera) and isinstance(projector, BurstProjector)
     with report_driver_faults(projector):
         burst = projector.prepare()
+    with report_driver_faults(camera):
+        exposure_ms = camera.settings().exposure_ms
+    if exposure_ms and exposure_ms > burst.period_ms:
+        raise DeviceError(
+            f"an exposure of {exposure_ms:.4g} ms does not fit a burst with {burst.period_ms:.4g}"
+            " ms a pattern: set a shorter one, or fewer patterns a picture"
+        )
     frames = np.empty((burst.most, *out.shape[1:]), out.dtype)
     try:
         with report_driver_faults(camera):

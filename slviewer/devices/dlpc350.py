@@ -55,27 +55,20 @@ RUN_STOPPED, RUN_STARTED = 0, 2
 """Arguments of `Command.RUN`."""
 
 _STATUS = (
-    (Command.HARDWARE_STATUS, 0, 0, "did not start up: switch it off and on"),
-    (Command.HARDWARE_STATUS, 2, 1, "has a fault in the control of its mirrors: return it"),
-    (Command.HARDWARE_STATUS, 3, 1, "was forced to change pictures: show fewer a second"),
-    (Command.HARDWARE_STATUS, 6, 1, "aborted the sequence: check the video signal"),
-    (Command.HARDWARE_STATUS, 7, 1, "has an error in its sequence: switch it off and on"),
-    (Command.SYSTEM_STATUS, 0, 0, "failed its memory test: switch it off and on, or return it"),
-    (Command.MAIN_STATUS, 0, 1, "has its mirrors parked: switch it off and on"),
-    (
-        Command.MAIN_STATUS,
-        1,
-        0,
-        "stopped its sequence: check that 912x1140 at its refresh rate arrives by HDMI",
-    ),
-    (
-        Command.MAIN_STATUS,
-        2,
-        1,
-        "shows one picture for ever, its buffer is frozen: end other programs that control it",
-    ),
+    (Command.MAIN_STATUS, 0, 1, False, "has its mirrors parked: switch it off and on"),
+    (Command.MAIN_STATUS, 1, 0, True, "stopped its sequence: check that 912x1140 arrives by HDMI"),
+    (Command.MAIN_STATUS, 2, 1, False, "has a frozen buffer: end other programs that control it"),
+    (Command.HARDWARE_STATUS, 0, 0, False, "did not start up: switch it off and on"),
+    (Command.HARDWARE_STATUS, 2, 1, False, "has a fault in the control of its mirrors: return it"),
+    (Command.HARDWARE_STATUS, 3, 1, True, "was forced to change pictures: check refresh_hz"),
+    (Command.HARDWARE_STATUS, 6, 1, True, "aborted its sequence: check the video signal"),
+    (Command.HARDWARE_STATUS, 7, 1, True, "has an error in its sequence: switch it off and on"),
+    (Command.SYSTEM_STATUS, 0, 0, False, "failed its memory test: switch it off and on"),
 )
-"""Command, bit, the value of the bit that is a fault, and what it means (guide, 2.1)."""
+"""Command, bit, the value of the bit that is a fault, whether it is one of a sequence (and may be
+left of an earlier one), and what it means (guide, 2.1)."""
+_RUNNING = 0b010
+"""Lower bits of the main status: mirrors not parked, sequence running, buffer not frozen."""
 
 _INVALID = (
     "the exposure or the period is out of range",
@@ -200,24 +193,23 @@ class Dlpc350:
         """Start the sequence, and wait until it runs."""
         self.set(Command.RUN, RUN_STARTED)
         end = self._clock() + _SETTLE_S
-        while not self.read(Command.MAIN_STATUS) & 2 and self._clock() < end:
+        while not self.read(Command.MAIN_STATUS) & _RUNNING and self._clock() < end:
             pass
         self.check_running()
 
     def check_running(self) -> None:
         """Raise DeviceError unless it shows pictures as they come."""
-        main = self.read(Command.MAIN_STATUS)
-        for command, bit, fault, words in _STATUS:
-            if command == Command.MAIN_STATUS and main >> bit & 1 == fault:
-                raise DeviceError(f"{self._name} {words}")
+        if self.read(Command.MAIN_STATUS) & 0b111 != _RUNNING:
+            raise DeviceError(f"{self._name} {'; it '.join(self.list_faults(is_running=True))}")
 
-    def list_faults(self) -> list[str]:
-        """Return a clause for each fault that its status bytes report; not whether it runs."""
+    def list_faults(self, is_running: bool) -> list[str]:
+        """Return a clause for each fault that its status reports, those of a sequence where one
+        runs."""
         read = {command: self.read(command) for command in {row[0] for row in _STATUS}}
         return [
             words
-            for command, bit, fault, words in _STATUS
-            if read[command] >> bit & 1 == fault and (command, bit) != (Command.MAIN_STATUS, 1)
+            for command, bit, fault, of_sequence, words in _STATUS
+            if read[command] >> bit & 1 == fault and (is_running or not of_sequence)
         ]
 
     def send_sequence(self, entries: list[bytes], period_us: int, triggers: bytes) -> list[str]:

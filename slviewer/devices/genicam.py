@@ -307,8 +307,8 @@ class GenicamCamera(CameraDriver):
     up to 12 bits that comes unpacked; of a colour camera its colours, of which `grab` decodes the
     `channel`, and `grab_colour` all three. `trigger` "software" (where it has one), "hardware" with
     the name of its `line`, or "free"; by hardware it also takes the bursts of a projector that
-    triggers it. Raises InputError for what the camera has not, or where
-    several fit; DeviceError where none is connected.
+    triggers it. Raises InputError for what the camera has not, or where several fit; DeviceError
+    where none is connected.
     """
 
     producer: str | None = None

@@ -249,8 +249,8 @@ class LightCrafter4500(Openable):
         self._is_stepping = False
         self._pictures.open()
         control.set(Command.POWER, 0)
-        control.set(Command.FREEZE, 0)
-        if faults := control.list_faults():
+        control.write(Command.FREEZE, b"\0")
+        if faults := control.list_faults(is_running=False):
             raise DeviceError(f"{self.name} {'; it '.join(faults)}")
         control.write(Command.SOURCE, bytes([_PARALLEL_24_BIT]))
         if (currents := self._timing.led_currents) is not None:
@@ -306,7 +306,8 @@ class LightCrafter4500(Openable):
         self._send(control, is_burst=True)
         count, n = timing.count, len(pictures)
         most = (n + 2 + 2 * _LEAD + _SPARE) * count
-        return PatternBurst(places, count, n * count, timing.period_us / 1000, most)
+        seconds = (n + 2) / timing.refresh_hz
+        return PatternBurst(places, count, n * count, timing.period_us / 1000, seconds, most)
 
     def run(self) -> None:
         """Show what was prepared once."""

@@ -212,19 +212,15 @@ class Projector(Protocol):
 class PatternBurst:
     """A sequence that is shown at once, with a trigger for each pattern: dark, `marker` white ones,
     `length` patterns of which each frame has its place in `places`, `marker` white ones, dark;
-    `most` triggers in all.
+    `most` triggers in all. `seconds`: how long patterns and markers last.
     """
 
     places: tuple[int, ...]
     marker: int
     length: int
     period_ms: float
+    seconds: float
     most: int
-
-    @property
-    def seconds(self) -> float:
-        """How long the patterns and their markers last."""
-        return (self.length + 2 * self.marker) * self.period_ms / 1000
 
 
 @runtime_checkable

@@ -2,8 +2,10 @@
 can go wrong with them on a simulated controller."""
 
 import json
+import struct
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -23,7 +25,7 @@ from slviewer.devices.lightcrafter4500 import (
     PatternTiming,
     list_lightcrafters,
 )
-from slviewer.devices.protocols import Rig
+from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import SimulatedProjector
 from slviewer.devices.simulated_dlpc350 import (
     SimulatedDlpc350,
@@ -158,6 +160,33 @@ def test_the_device_is_found_by_its_serial_number(monkeypatch):
 def test_an_entry_of_the_look_up_table_has_its_bits_in_place():
     assert lut_entry(0, 8, 7, first=True, black=False).hex() == "017800"
     assert lut_entry(2, 7, 4, first=False, black=True).hex() == "0b4702"
+
+
+@pytest.mark.parametrize(
+    ("main", "hardware", "system", "at_start", "running"),
+    [
+        (0b010, 1, 1, [], []),
+        (0b000, 1, 1, [], ["stopped", "HDMI"]),
+        (0b110, 1, 1, ["frozen"], ["frozen"]),
+        (0b011, 1, 1, ["parked"], ["parked"]),
+        (0b000, 0b11001001, 1, [], ["stopped", "forced", "aborted", "error"]),
+        (0b010, 0b100, 0, ["start up", "mirrors", "memory"], []),
+    ],
+)
+def test_status_bits_are_put_into_words(main, hardware, system, at_start, running):
+    bits = {Command.MAIN_STATUS: main, Command.HARDWARE_STATUS: hardware}
+
+    class Status(Recorder):
+        def read(self, timeout_s: float) -> bytes:
+            _, number, _, command = struct.unpack_from("<BBHH", self.written[-1])
+            value = bits.get(command, system)
+            return bytes([0xC0, number, 1, 0, value]).ljust(64, b"\0")
+
+    control = Dlpc350(Status(), "the controller")
+    faults = control.list_faults(is_running=False)
+    assert not missing_facts("; ".join(faults), *at_start) and len(faults) == len(at_start)
+    with raises(DeviceError, *running) if running else nullcontext():
+        control.check_running()
 
 
 def test_a_mode_or_a_validation_that_takes_too_long_is_an_error(world):
@@ -377,6 +406,24 @@ def test_the_terminal_scans_verifies_and_merges_with_bursts(recorded, tmp_path, 
     merge = ("merge", session, "ball_2", "--reference", "ball_1", "--start", "identity")
     status, _, error = run(*merge)
     assert status == 0, error
+
+
+@pytest.mark.parametrize(
+    ("settings", "seconds"), [((8,), 0.25), ((7,), 0.183), ((8, 1, 8333), 0.45)]
+)
+def test_a_burst_lasts_as_long_as_its_pictures(world, settings, seconds):
+    rig, _ = simulated_lightcrafter(world, PatternTiming(*settings))
+    assert isinstance(rig.projector, LightCrafter4500)
+    with rig.opened():
+        rig.projector.load(PatternSequence(SIZE, p18(SIZE).frames[:25]))
+        assert rig.projector.prepare().seconds == pytest.approx(seconds, abs=1e-3)
+
+
+def test_an_exposure_longer_than_a_pattern_is_refused(lightcrafter):
+    rig, _ = lightcrafter
+    rig.camera.apply(CameraSettings(exposure_ms=9.0))
+    with raises(DeviceError, 9, 8.333, "exposure"):
+        capture_frames(rig, SHORT)
 
 
 def test_a_rig_file_chooses_the_driver_and_its_settings(monkeypatch):
