@@ -508,6 +508,7 @@ def draw_preview(
     if preview.second is None:
         return picture
     beside = cv2.resize(fitted(preview.second), picture.shape[1::-1], interpolation=cv2.INTER_AREA)
+    beside[:, :2] = 255  # a line between both
     return np.hstack([picture, beside])
 
 

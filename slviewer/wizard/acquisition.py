@@ -206,6 +206,7 @@ class Acquisition(Service):
                 self._view = replace(
                     self._view, state="opening", name=rig.name, camera=rig.camera.size,
                     projector=rig.projector.size,
+                    second=rig.second.size if rig.second else None,
                     turntable=rig.turntable.name if rig.turntable else "",
                 )  # fmt: skip
                 if not self._thread.ident:

@@ -93,14 +93,15 @@ class CaptureProgress:
 
 @dataclass(frozen=True)
 class RigView:
-    """The devices: `camera` and `projector` sizes are (width, height) px; what a device does not
-    report is None."""
+    """The devices: sizes of `camera`, `projector` and `second` camera are (width, height) px; what
+    a device does not report, or is not there, is None."""
 
     state: RigState = "none"
     name: str = ""
     simulated: bool = False
     camera: tuple[int, int] | None = None
     projector: tuple[int, int] | None = None
+    second: tuple[int, int] | None = None
     exposure_ms: float | None = None
     gain: float | None = None
     light: str = "white"  # what the projector shows between captures

@@ -141,8 +141,9 @@ class RigChoice(PanelPart):
             if {**preset.choice, "settle_ms": None} == {**rig.choice, "settle_ms": None}:
                 return name
         if rig.choice.get("driver") == "simulated":
-            scale = rig.choice.get("scale", 1.0)
-            return next((name for name, r in SIMULATED.items() if r["scale"] == scale), _CHOOSE)
+            scale, cameras = rig.choice.get("scale", 1.0), rig.choice.get("cameras", 1)
+            same = (name for name, each in SIMULATED.items() if each["scale"] == scale)
+            return next(same, _CHOOSE) if cameras == 1 else _CUSTOM
         return _CUSTOM
 
     def _request_choice(self, chosen: str) -> None:
@@ -224,9 +225,11 @@ def _rig_html(rig: RigView) -> str:
         return note("Opening …")
     sizes = [
         f"{what} {size[0]} × {size[1]} px"
-        for what, size in (("camera", rig.camera), ("projector", rig.projector))
+        for what, size in (
+            ("camera", rig.camera), ("second camera", rig.second), ("projector", rig.projector),
+        )
         if size
-    ]
+    ]  # fmt: skip
     html = paragraph(
         Html(f"{coloured('●', 'good')} {to_html(rig.name)} · {to_html(', '.join(sizes))}")
     )
