@@ -242,9 +242,11 @@ _AROUND_PX = 96  # titles above, the legend below
 
 
 def reason_shares(phase: PhaseMap) -> dict[Reason, float]:
-    """Share of the pixels for each reason, VALID included, 0 to 1."""
+    """Share of the pixels for each reason, VALID included, 0 to 1; without UNSEEN where no second
+    camera is the reason."""
     counts = np.bincount(phase.reason.ravel(), minlength=max(Reason) + 1)
-    return {reason: float(counts[reason] / max(1, phase.reason.size)) for reason in Reason}
+    shares = {reason: float(counts[reason] / max(1, phase.reason.size)) for reason in Reason}
+    return {why: share for why, share in shares.items() if share or why != Reason.UNSEEN}
 
 
 def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
@@ -300,6 +302,7 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
                 label=f"{REASON_LABELS[code]} {100 * shares[code]:.1f} %",
             )
             for code, colour in REASON_COLOURS.items()
+            if code in shares
         ]
         axes.legend(
             handles=patches,
