@@ -106,8 +106,8 @@ def prove(
 
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
-        only: What to prove: accuracy on planes and spheres, causes of bad calibrations and
-            captures, printed edges, guidance of an operator to good poses, captures of a hostile
+        only: What to prove: accuracy on planes and spheres, two cameras, causes of bad
+            calibrations and captures, printed edges, guidance of an operator to good poses, captures of a hostile
             rig, tolerances of an inspection plan, registration of scans, reported situations,
             surfaces that light themselves, uncertainty against true errors; by default all.
         cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or

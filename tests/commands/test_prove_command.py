@@ -51,6 +51,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
     assert "FAIL" in said.out and "causes" in said.err
     assert {claim: proof["holds"] for claim, proof in json.loads(out.read_text()).items()} == {
         "accuracy": True,
+        "cameras": True,
         "causes": False,
         "edges": True,
         "guidance": True,
