@@ -88,12 +88,11 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
         return ()
     # one that accounts for all images, rather than one that leaves some out
     first, *others = rated
-    most = limits.LEFT_OF_RIVAL * first.comparison.left + limits.LEFT_LEAST
     complete = [
         r
         for r in others
         if r.net + gained > limits.RIVAL * (first.net + gained)
-        and r.comparison.left < most
+        and r.comparison.left < first.most_left
         and not r.hypotheses[0].loses_images
     ]
     for each in (first, *complete):
@@ -142,7 +141,7 @@ def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") ->
     rivals = [
         h
         for each in rated
-        if each.net > limits.RIVAL * found.net
+        if each.comparison.left < found.most_left
         for h in each.hypotheses[:1]
         if h.cause == "frame-lag" and h.frames
     ]
@@ -158,6 +157,11 @@ class _Rated:
     comparison: MisfitChange
     net: float
     turned: float
+
+    @property
+    def most_left(self) -> float:
+        """Misfit up to which another explanation is about as likely."""
+        return limits.LEFT_OF_RIVAL * self.comparison.left + limits.LEFT_LEAST
 
 
 def _least_sigmas(rated: _Rated, gained: float) -> float:
