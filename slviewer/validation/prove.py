@@ -107,9 +107,10 @@ def prove(
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
         only: What to prove: accuracy on planes and spheres, two cameras, causes of bad
-            calibrations and captures, printed edges, guidance of an operator to good poses, captures of a hostile
-            rig, tolerances of an inspection plan, registration of scans, reported situations,
-            surfaces that light themselves, uncertainty against true errors; by default all.
+            calibrations and captures, printed edges, guidance of an operator to good poses,
+            captures of a hostile rig, tolerances of an inspection plan, registration of scans,
+            reported situations, surfaces that light themselves, uncertainty against true errors; by
+            default all.
         cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or
             gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.
