@@ -80,17 +80,28 @@ def decode_capture(
 
 
 def match_second(
-    capture: Capture, phases: dict[Axis, PhaseMap], calibration: PairCalibration | None = None
+    capture: Capture,
+    phases: dict[Axis, PhaseMap],
+    calibration: PairCalibration | None = None,
+    warn: Warn = ignore_warnings,
 ) -> dict[Axis, PhaseMap]:
     """Return what a capture is reconstructed from: its decoded ``phases``, or, where two cameras
     saw it, the coordinates of the second one, as `match_cameras` does.
 
-    Raises InputError for phases that are not absolute, and for patterns along one axis unless the
-    cameras' ``calibration`` is known.
+    Its frames are examined as those of the first; ``warn`` is called with what is found.
+
+    Raises InputError for frames that the examination rejects, for phases that are not absolute, and
+    for patterns along one axis unless the cameras' ``calibration`` is known.
     """
-    if capture.second is None:
+    second = capture.second
+    if second is None:
         return phases
-    return match_cameras(phases, decode_capture(capture.second), calibration)
+    look = look_at_capture(second)
+    examination = examine_frames(second.sequence, look.stack, second.files, look)
+    raise_rejected(second.name, examination)
+    for message in examination.warnings():
+        warn(f"{second.name}: {message}")
+    return match_cameras(phases, decode_capture(second, look), calibration)
 
 
 def decode_frames(
@@ -295,7 +306,7 @@ def decode_captures(
             for message in [*messages, *loss_warnings(capture.sequence, frames, phases)]:
                 warn(f"{capture.name}: {message}")
         if matched and capture.second is not None:
-            phases = match_second(capture, phases, load_pair(session))
+            phases = match_second(capture, phases, load_pair(session), warn)
         yield capture, frames, phases
 
 

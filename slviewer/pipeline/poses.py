@@ -45,7 +45,8 @@ EVIDENCE_VERSION = 8
 class DecodedPose:
     """A look at the frames of a target pose with what they were decoded to; ``texture`` (h, w) or
     (h, w, 3) uint8 shows the board; ``matched``: what its board is observed by, where that is not
-    the decoded phases but a second camera's coordinates."""
+    the decoded phases but a second camera's coordinates; ``fault``: why there are none of these.
+    """
 
     name: str
     sequence: PatternSequence
@@ -54,6 +55,7 @@ class DecodedPose:
     texture: np.ndarray
     board: Board
     matched: Mapping[Axis, PhaseMap] | None = None
+    fault: str = ""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,8 @@ def read_pose(
     observation: Observation | None = None
     refused, cause = "", ""
     try:
+        if pose.fault:
+            raise InputError(pose.fault)
         detection = detect(pose.board, pose.texture)
         observation = observe(name, pose.board, detection, pose.matched or phases, smoothing)
         if observed is not None:
@@ -115,8 +119,13 @@ def read_stored_pose(
     """Decode the frames of a pose, read it as ``read_pose`` does, and save the result and
     the check of the frames in the session."""
     phases, texture = decode_capture(capture, look), capture_texture(capture, look.stack)
-    matched = match_second(capture, phases) if capture.second else None
-    pose = DecodedPose(capture.name, capture.sequence, look, phases, texture, board, matched)
+    matched, fault = None, ""
+    try:
+        matched = match_second(capture, phases) if capture.second else None
+    except InputError as error:
+        fault = str(error)
+    decoded = capture.name, capture.sequence, look, phases, texture, board
+    pose = DecodedPose(*decoded, matched, fault)
     examined = partial(load_or_save_examination, store, capture, look)
     judged = read_pose(pose, smoothing, True, examined, observed)
     inputs = {capture.name: capture.hash}

@@ -4,19 +4,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import raises
 
+from slviewer.calibration.observe import Smoothing
 from slviewer.cli import main
 from slviewer.devices.capture import capture_frames, capture_with_texture
+from slviewer.errors import InputError
 from slviewer.fringe.presets import gray
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.capture_phases import decode_capture, match_second
 from slviewer.pipeline.models import load_calibration, load_pair
+from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.stored_records import load_record
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.verification import Verification
+from slviewer.session.capture import NewCapture, Role
 from slviewer.session.store import Session
 from slviewer.simulation.plans import spheres
+from slviewer.target.board import Board
 
 pytestmark = pytest.mark.computes
 TWO = {"driver": "simulated", "scale": 0.1, "cameras": 2}
@@ -63,6 +69,26 @@ def test_two_cameras_are_calibrated_scan_and_merge(tmp_path: Path) -> None:
     assert main(["verify", session, *names, "--shape", "sphere"]) == 0
     scans = ["object_r1", "object_r2", "object_r3"]
     assert main(["merge", session, *scans, "--reference", "object_r2"]) == 0
+
+
+def test_frames_of_the_second_camera_are_examined(tmp_path: Path) -> None:
+    """One frame late they decode, shifted by a step."""
+    session, rig = tmp_path / "session", {**TWO, "scale": 0.25}
+    roles: dict[str, Role] = {"pose": "calibration", "scan": "scan"}
+    for name, role in roles.items():
+        saved = capture(session, name, rig, role=role, patterns="p18")
+        assert saved.second is not None
+        late = NewCapture(name, saved.sequence, np.roll(saved.second.frames, 1, axis=0))
+        with Session.open(session, write=True) as store:
+            frames = saved.frames
+            store.save_capture(name, role, saved.sequence, frames, second=late, force=True)
+    with Session.open(session, write=True) as store:
+        scan = store.load_capture("scan")
+        with raises(InputError, "scan", "second camera", "one image"):
+            match_second(scan, decode_capture(scan))
+        board = Board.parse("circles:21x16:9")
+        (judged,) = read_stored_poses(store, ["pose"], board, Smoothing())
+    assert judged.observation is None and "second camera" in judged.refused
 
 
 def test_a_recorded_pair_gives_what_an_independent_decoding_gives(
