@@ -92,6 +92,22 @@ def test_the_flight_reaches_a_merged_ply(tmp_path: Path, rig: dict[str, Any]) ->
     assert "Capturing pose 1 of 8" in acts
 
 
+def test_the_flight_of_two_cameras_reaches_a_merged_ply(tmp_path: Path) -> None:
+    acts: list[str] = []
+    with flown(tmp_path / "session", "p18", acts, RIG | {"cameras": 2}) as operator:
+        snapshot = operator.snapshot()
+    session = session_of(snapshot)
+    assert [step.state for step in snapshot.steps] == ["done"] * 9
+    assert list_texts(snapshot, "error") == []
+    assert session.calibration is not None and session.calibration.best == "splined"
+    assert session.calibration.stereo.baseline_mm == pytest.approx(260, abs=2)
+    found = {each.name: each.record.models for each in session.list_records(Verification)}
+    plane, sphere = (found[name]["splined"] for name in ("plane_01", "sphere_01"))
+    assert plane.noise_floor_mm is not None and plane.rms_mm < 1.3 * plane.noise_floor_mm
+    assert sphere.radius_mm == pytest.approx(98, abs=0.1)
+    assert session.merge is not None and session.merge.record.points > 20_000
+
+
 def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     """Assert that the autopilot has calibrated, verified, scanned, merged and measured."""
     session = session_of(snapshot)
