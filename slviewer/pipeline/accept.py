@@ -64,6 +64,7 @@ from slviewer.pipeline.reconstruct import check_capture_sizes, reconstruct_captu
 from slviewer.pipeline.scale import record_scale, scale_factor
 from slviewer.pipeline.stored_records import list_records, load_record, match_names
 from slviewer.reconstruction.axis_agreement import check_sizes
+from slviewer.reconstruction.camera_match import epipolar_lines
 from slviewer.records.acceptance import AcceptanceTest, Contribution, ErrorBudget, PositionErrors
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.drift import Drift
@@ -260,7 +261,7 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     look = look_at_capture(shot)
     frames, decoded = look.stack, decode_capture(shot, look)
     check_capture(capture, shot.sequence, frames, decoded, files=shot.files)
-    phases = match_second(shot, decoded, load_pair(store))
+    phases = match_second(shot, decoded, lambda _: epipolar_lines(load_pair(store)))
     check_sizes(capture, shot.size, shot.other_size, stereo.rig)
     board = Board.parse(stereo.board)
     detection = detect(board, capture_texture(shot, frames))

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
@@ -24,7 +25,7 @@ from slviewer.pipeline.examination import examine_frames, load_examination, load
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import load_pair
 from slviewer.pipeline.stored_records import SessionLike, opened
-from slviewer.reconstruction.camera_match import PairCalibration, match_cameras
+from slviewer.reconstruction.camera_match import Lines, epipolar_lines, match_cameras
 from slviewer.records.verdict import Examination
 from slviewer.report.maps import REASON_LABELS, phase_maps, reason_shares
 from slviewer.session.atomic import to_json
@@ -82,7 +83,7 @@ def decode_capture(
 def match_second(
     capture: Capture,
     phases: dict[Axis, PhaseMap],
-    calibration: PairCalibration | None = None,
+    lines: Callable[[np.ndarray], Lines] | None = None,
     warn: Warn = ignore_warnings,
 ) -> dict[Axis, PhaseMap]:
     """Return what a capture is reconstructed from: its decoded ``phases``, or, where two cameras
@@ -91,7 +92,8 @@ def match_second(
     Its frames are examined as those of the first; ``warn`` is called with what is found.
 
     Raises InputError for frames that the examination rejects, for phases that are not absolute, and
-    for patterns along one axis unless the cameras' ``calibration`` is known.
+    for patterns along one axis without ``lines``, which are asked for with the second camera's
+    texture then.
     """
     second = capture.second
     if second is None:
@@ -101,7 +103,15 @@ def match_second(
     raise_rejected(second.name, examination)
     for message in examination.warnings():
         warn(f"{second.name}: {message}")
-    return match_cameras(phases, decode_capture(second, look), calibration)
+    known = None
+    if lines is not None and len(phases) == 1:
+        known = lines(capture_texture(second, look.stack))
+    return match_cameras(phases, decode_capture(second, look), known)
+
+
+def _calibrated_lines(session: Session, _: np.ndarray) -> Lines:
+    """Return the epipolar lines of a session's cameras, whatever the texture."""
+    return epipolar_lines(load_pair(session))
 
 
 def decode_frames(
@@ -306,7 +316,8 @@ def decode_captures(
             for message in [*messages, *loss_warnings(capture.sequence, frames, phases)]:
                 warn(f"{capture.name}: {message}")
         if matched and capture.second is not None:
-            phases = match_second(capture, phases, load_pair(session), warn)
+            lines = partial(_calibrated_lines, session)
+            phases = match_second(capture, phases, lines, warn)
         yield capture, frames, phases
 
 

@@ -16,11 +16,20 @@ from slviewer.calibration.diagnosis.frames import (
     measure_white_delay,
 )
 from slviewer.calibration.diagnosis.numbering import detect_grid_size
-from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing, observe, pitch_px
+from slviewer.calibration.observe import (
+    AXES,
+    READING_VERSION,
+    Observation,
+    Smoothing,
+    observe,
+    pitch_px,
+)
 from slviewer.errors import BoardError, DamagedError, InputError
 from slviewer.examination.light import Look
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.polynomial import fit_polynomial
+from slviewer.geometry.vectors import rms
 from slviewer.pipeline.capture_phases import (
     capture_texture,
     check_capture,
@@ -30,6 +39,7 @@ from slviewer.pipeline.capture_phases import (
     match_second,
 )
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
+from slviewer.reconstruction.camera_match import Lines
 from slviewer.records.plain import to_plain
 from slviewer.records.verdict import Cause, Examination
 from slviewer.session.capture import Capture
@@ -37,6 +47,9 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask, detect
 
+LINES_DEGREE = 5
+"""Of the polynomial through a board's features: perspective and distortion leave less than
+noise."""
 EVIDENCE_VERSION = 8
 """Version of the examination; evidence that was stored by another version is computed again."""
 
@@ -121,7 +134,9 @@ def read_stored_pose(
     phases, texture = decode_capture(capture, look), capture_texture(capture, look.stack)
     matched, fault = None, ""
     try:
-        matched = match_second(capture, phases) if capture.second else None
+        if capture.second:
+            lines = partial(board_lines, board, next(iter(phases)), texture)
+            matched = match_second(capture, phases, lines)
     except InputError as error:
         fault = str(error)
     decoded = capture.name, capture.sequence, look, phases, texture, board
@@ -150,6 +165,32 @@ def _reading_settings(board: Board, smoothing: Smoothing) -> dict[str, Any]:
     if smoothing.kind != "spline":
         settings.append(smoothing.degree)
     return {"target": str(board), "smoothing": settings, "reading": READING_VERSION}
+
+
+def board_lines(board: Board, axis: Axis, first: np.ndarray, second: np.ndarray) -> Lines:
+    """Return the board's coordinate, mm, that varies along the fringes of ``axis``, at each pixel
+    of two cameras' textures: by a polynomial through the features, within the board's outline.
+
+    Raises DetectionError where one does not show the board.
+    """
+    maps, sigmas, along = list[np.ndarray](), list[float](), -1
+    for texture in (first, second):
+        height, width = texture.shape[:2]
+        detection = detect(board, texture)
+        (u, v), points = detection.pixels.T, board.points[detection.ids][:, :2]
+        if along < 0:
+            slopes = np.linalg.lstsq(np.column_stack([u, v, np.ones(len(u))]), points, rcond=None)[
+                0
+            ]
+            along = int(np.argmax(np.abs(slopes[1 if axis == "x" else 0])))
+        values = points[:, along]
+        fit = fit_polynomial(u, v, values, None, (width, height), LINES_DEGREE, robust=True)
+        inside = board_mask(board, detection, (height, width))
+        maps.append(np.where(inside, fit.evaluate_grid((height, width)), np.nan))
+        # what the coefficients take of the scatter
+        share = (LINES_DEGREE + 1) * (LINES_DEGREE + 2) / 2 / len(u)
+        sigmas.append(rms(values - fit.evaluate(u, v)) * share**0.5)
+    return Lines(maps[0], maps[1], (sigmas[0], sigmas[1]), AXES)
 
 
 def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:

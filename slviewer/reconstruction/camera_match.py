@@ -8,12 +8,12 @@ triangulation and models are those of a camera and a projector.
 
 Patterns along one axis give one phase. The other number is then the epipolar line, as the row of
 both rectified images (Hartley and Zisserman, Multiple View Geometry, 11.12), which only a
-calibrated pair has.
+calibrated pair has; on a board that both see, the board's own coordinate.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -56,42 +56,51 @@ class PairCalibration(Protocol):
         """Undistorted normalised coordinates (h, w, 2) of each pixel of both cameras."""
 
 
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """What numbers points besides a single phase: maps (h, w) of the ``first`` and the ``second``
+    camera, NaN where unknown, whose standard deviations are ``sigmas``; and the ``axes`` of the
+    second camera that are known then."""
+
+    first: np.ndarray
+    second: np.ndarray
+    sigmas: tuple[float, float]
+    axes: tuple[Axis, ...]
+
+
 def match_cameras(
     first: Mapping[Axis, PhaseMap],
     second: Mapping[Axis, PhaseMap],
-    calibration: PairCalibration | None = None,
+    lines: Lines | None = None,
 ) -> dict[Axis, PhaseMap]:
     """Return, by axis, the pixel coordinates of the second camera that see what the pixels of the
     first see, as phase maps (h, w) of the first: along x its columns, along y its rows.
 
-    ``first``, ``second``: the absolute phases that each camera decoded. ``calibration``: of the
-    cameras, the second in the projector's place, needed where the patterns have one axis; the
-    result then has the axis along which the cameras are apart. Sigma is that of both cameras'
-    phases. Masked as `Reason.UNSEEN` where the second camera sees no such point, or an edge.
+    ``first``, ``second``: the absolute phases that each camera decoded. ``lines``: needed where the
+    patterns have one axis. Sigma is that of both cameras' phases. Masked as `Reason.UNSEEN` where
+    the second camera sees no such point, or an edge.
 
-    Raises InputError for one axis without a calibration.
+    Raises InputError for one axis without lines.
     """
-    axes = [axis for axis in first if axis in second]
+    axes: tuple[Axis, ...] = tuple(axis for axis in first if axis in second)
     known = [first[axis].correct_edges() for axis in axes]
     seen = [second[axis].correct_edges() for axis in axes]
     numbers = [[phase.coordinate for phase, _ in each] for each in (known, seen)]
     sigmas = [[np.hypot(phase.sigma_px, error) for phase, error in each] for each in (known, seen)]
-    kept = axes
     if len(axes) == 1:
-        if calibration is None:
+        if lines is None:
             raise InputError(
                 "Cannot match the two cameras: their patterns have one axis, and no calibration of"
-                " the cameras gives the other. Calibrate with patterns along both axes, or import a"
+                " the cameras gives the other. Calibrate from target poses, or import a"
                 " calibration."
             )
-        for maps, errors, rows in zip(numbers, sigmas, rectified_rows(calibration), strict=True):
-            maps.append(rows)
-            errors.append(np.zeros_like(rows))
-        apart = np.abs(calibration.pinholes.t)
-        kept = ["x" if apart[0] >= apart[1] else "y"]
+        axes = lines.axes
+        for k, rows in enumerate((lines.first, lines.second)):
+            numbers[k].append(rows)
+            sigmas[k].append(np.full_like(rows, lines.sigmas[k]))
     found = _find(*(np.stack(maps, axis=-1, dtype=np.float64) for maps in (*numbers, *sigmas)))
     own = [phase for phase, _ in known]
-    return {axis: _as_phase(axis, own, found) for axis in kept}
+    return {axis: _as_phase(axis, own, found) for axis in axes}
 
 
 def _as_phase(axis: Axis, own: Sequence[PhaseMap], found: np.ndarray) -> PhaseMap:
@@ -113,9 +122,9 @@ def _as_phase(axis: Axis, own: Sequence[PhaseMap], found: np.ndarray) -> PhaseMa
     )  # fmt: skip
 
 
-def rectified_rows(calibration: PairCalibration) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row (h, w) px of each pixel of both cameras in the rectified pair: equal where
-    both can see the same point."""
+def epipolar_lines(calibration: PairCalibration) -> Lines:
+    """Return the row, px, of each pixel of both cameras in the rectified pair: equal where both can
+    see the same point. They add the axis along which the cameras are apart."""
     rig = calibration.pinholes
     across = -rig.R.T @ rig.t  # from the first camera's centre to the second's
     across /= np.linalg.norm(across)
@@ -131,7 +140,8 @@ def rectified_rows(calibration: PairCalibration) -> tuple[np.ndarray, np.ndarray
         return np.ascontiguousarray(focal * x / z)
 
     first, second = calibration.device_rays()
-    return rows(first, frame), rows(second, frame @ rig.R.T)
+    apart: Axis = "x" if abs(rig.t[0]) >= abs(rig.t[1]) else "y"
+    return Lines(rows(first, frame), rows(second, frame @ rig.R.T), (0.0, 0.0), (apart,))
 
 
 def _find(

@@ -19,7 +19,7 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET
-from slviewer.reconstruction.camera_match import match_cameras
+from slviewer.reconstruction.camera_match import epipolar_lines, match_cameras
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.records.verification import Shape
 from slviewer.simulation.plans import letter_plan, rotation
@@ -76,7 +76,7 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
     def scan_pair(actual: SimulatedRig, scene: Scene, number: int) -> PhaseMap:
         """Return the second camera's columns, as scanned with a rig."""
         seen = seen_by_both(actual, second, scene, scan_sequence(rig), number)
-        return match_cameras(*seen, own[1])["x"]
+        return match_cameras(*seen, epipolar_lines(own[1]))["x"]
 
     def scan_alone(actual: SimulatedRig, scene: Scene, number: int) -> PhaseMap:
         """Return the projector's columns, as scanned with a rig."""

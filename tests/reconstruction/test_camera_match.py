@@ -13,7 +13,7 @@ from slviewer.fringe.presets import p18
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.reconstruction.camera_match import match_cameras, rectified_rows
+from slviewer.reconstruction.camera_match import epipolar_lines, match_cameras
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -85,14 +85,15 @@ def test_one_axis_is_matched_along_epipolar_lines(plane):
     first, second, true = ({"x": plane[0]["x"]}, {"x": plane[1]["x"]}, plane[2])
     with raises(InputError, "one axis", "calibration"):
         match_cameras(first, second)
-    (matched,) = match_cameras(first, second, true_calibration()).values()
+    (matched,) = match_cameras(first, second, epipolar_lines(true_calibration())).values()
     assert matched.axis == "x"
     known = check_errors(matched, true, 0)
     assert known.sum() > 0.98 * first["x"].mask.sum()
 
 
 def test_rows_of_both_cameras_agree(plane):
-    first, second = rectified_rows(true_calibration())
+    lines = epipolar_lines(true_calibration())
+    first, second = lines.first, lines.second
     places = plane[2]
     inside = np.isfinite(places).all(-1) & (np.abs(places - [199.5, 149.5]) < [199, 149]).all(-1)
     u, v = np.rint(places[inside]).astype(int).T
