@@ -54,7 +54,7 @@ class Bench:
         self.acquisition = Acquisition(
             self.notices,
             self._record_progress,
-            lambda frame, _: self.previews.append(frame),
+            lambda frame, *_: self.previews.append(frame),
             Timing(retry_s=0.1, previews_per_s=50.0),
             clock,
         )
