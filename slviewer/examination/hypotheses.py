@@ -299,4 +299,5 @@ def _invert(frame: Frame) -> Frame:
 
 def _renumber(number: Mapping[int, int], frame: Frame) -> Frame:
     """Return a frame with the other number of its bit, if it has one."""
-    return replace(frame, bit=number.get(frame.bit, frame.bit)) if frame.bits else frame
+    is_bit = frame.kind in ("gray", "inverse")
+    return replace(frame, bit=number.get(frame.bit, frame.bit)) if is_bit else frame
