@@ -103,10 +103,9 @@ def letter(
     if texture not in ("coarse", "fine"):
         raise InputError(f"the local distortion's texture is coarse or fine, not {texture!r}")
     preset = tomllib.loads(asset("simulation/letter.toml").read_text(encoding="utf-8"))
-    rms = local_distortion_px
     streams = np.random.SeedSequence([seed, 0x51]).spawn(3)
     camera, projector = (
-        sample_device(stream, preset, name, texture, rms)
+        sample_device(stream, preset, name, texture, local_distortion_px)
         for name, stream in zip(("camera", "projector"), streams[:2], strict=True)
     )
     R, t = sample_arrangement(streams[2], preset, "arrangement")

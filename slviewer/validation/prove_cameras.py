@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.observe import observe
+from slviewer.calibration.observe import Observation, observe
 from slviewer.evaluation.fit import Comparison
 from slviewer.fringe.decode import texture
 from slviewer.fringe.phase import PhaseMap
@@ -26,7 +26,7 @@ from slviewer.simulation.plans import letter_plan, rotation
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene, Spheres
-from slviewer.simulation.second_camera import SecondCamera, second_camera
+from slviewer.simulation.second_camera import second_camera
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
@@ -54,20 +54,13 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
     """Calibrate the Letter's rig with a second camera, and without; measure its planes and spheres
     with both, as it was calibrated and with the projector turned."""
     rig = letter(scale, seed)
-    second = second_camera(rig)
     plan = letter_plan(rig, poses=POSES)
     turn = rotation(np.array([0.0, TURN_RAD, 0.0]))
     turned = replace(rig, R=turn @ rig.R, t=turn @ rig.t)
-    pair = second.pair(rig)
-    both = p18(rig.projector.size)
+    pair = second_camera(rig).pair(rig)
     poses = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
     observations = [
-        observe(
-            name,
-            Board.parse(TARGET),
-            detect(Board.parse(TARGET), texture(both, Renderer(rig, scene).capture(both, i))),
-            match_cameras(*seen_by_both(rig, second, scene, both, i)),
-        )
+        observe_pair(rig, scene, name, i)
         for i, (name, scene, _) in enumerate(track(progress, poses, 0.0, 0.35))
     ]
     own = calibrate_observed(pair, observations)
@@ -75,7 +68,8 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
 
     def scan_pair(actual: SimulatedRig, scene: Scene, number: int) -> PhaseMap:
         """Return the second camera's columns, as scanned with a rig."""
-        seen = seen_by_both(actual, second, scene, scan_sequence(rig), number)
+        sequence = scan_sequence(rig)
+        seen = decode_both(sequence, capture_both(actual, scene, sequence, number))
         return match_cameras(*seen, epipolar_lines(own[1]))["x"]
 
     def scan_alone(actual: SimulatedRig, scene: Scene, number: int) -> PhaseMap:
@@ -109,17 +103,29 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
     return prove_checks(checks, scale, rows, {"rigs": rows}, [title])
 
 
-def seen_by_both(
-    rig: SimulatedRig, second: SecondCamera, scene: Scene, sequence: PatternSequence, number: int
+def capture_both(
+    rig: SimulatedRig, scene: Scene, sequence: PatternSequence, number: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames (n, h, w) of both cameras; the second one follows from the rig's seed,
+    wherever its projector is."""
+    first = Renderer(rig, scene).capture(sequence, number)
+    return first, second_camera(rig).capture(scene, sequence, number)
+
+
+def decode_both(
+    sequence: PatternSequence, frames: tuple[np.ndarray, np.ndarray]
 ) -> tuple[dict[Axis, PhaseMap], dict[Axis, PhaseMap]]:
-    """Return the phases that both cameras decode of a scene, its projector as in ``rig``."""
-    to_second = rig.R @ second.R.T
-    moved = replace(second.rig, R=to_second, t=rig.t - to_second @ second.t)
-    first, other = (
-        Renderer(each, view).capture(sequence, number)
-        for each, view in ((rig, scene), (moved, second.view(scene)))
-    )
-    return decode_frames("first", sequence, first), decode_frames("second", sequence, other)
+    """Return the phases that both cameras decode."""
+    first, second = frames
+    return decode_frames("first", sequence, first), decode_frames("second", sequence, second)
+
+
+def observe_pair(rig: SimulatedRig, scene: Scene, name: str, number: int) -> Observation:
+    """The observation of a rendered target pose by both cameras, whose noise ``number`` seeds."""
+    sequence, board = p18(rig.projector.size), Board.parse(TARGET)
+    frames = capture_both(rig, scene, sequence, number)
+    matched = match_cameras(*decode_both(sequence, frames))
+    return observe(name, board, detect(board, texture(sequence, frames[0])), matched)
 
 
 def measure_shapes(
