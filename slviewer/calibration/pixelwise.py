@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from slviewer.calibration.observe import Observation
@@ -22,7 +22,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats, Floats32
 from slviewer.geometry.shapes import Plane, fit_plane
 from slviewer.geometry.triangulation import MARGIN, depth_per_px, ray_depth, triangulate_pixels
@@ -90,7 +90,16 @@ class PixelwiseModel:
         fit = self.fits[phase.axis]
         out = np.empty((*phase.phase.shape, 3), np.float32)
         ratio = phase.period_px / self.periods_px[phase.axis]
-        _evaluate(phase.phase, ratio, fit.coefficients, fit.phase_min, fit.phase_max, out)
+        run_rows(
+            _evaluate,
+            len(out),
+            phase.phase,
+            ratio,
+            fit.coefficients,
+            fit.phase_min,
+            fit.phase_max,
+            out,
+        )
         return out
 
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
@@ -302,7 +311,9 @@ def _collect_rows(
             ratio = o.periods_px[axis] / model.periods_px[axis]
             np.multiply(smooth[axis], ratio, out=phase[i][box], where=region)
         plane = model.planes[o.name]
-        _project_onto_plane(
+        run_rows(
+            _project_onto_plane,
+            len(region),
             smooth[depth_axis], region, o.periods_px[depth_axis] / (2 * np.pi),
             rig.camera.rays()[first:last, u0:u1], rig.R.copy(), rig.t.copy(),
             rig.projector.parameters, "xy".index(depth_axis), extent, plane.normal, plane.offset,
@@ -338,8 +349,20 @@ def _fit_rows(
     phase_ref = np.nan_to_num(2 * np.pi * coordinate / model.periods_px[axis])
     a, rms_z = np.empty((3, *phase.shape[1:])), np.empty(phase.shape[1:])
     poses, least, most = fit.poses[rows], fit.phase_min[rows], fit.phase_max[rows]
-    fit_rational(
-        phase, z, phase_ref, z_ref, MIN_POSES, a, rms_z, poses, least, most, fit.condition[rows]
+    run_rows(
+        fit_rational,
+        phase.shape[1],
+        phase,
+        z,
+        phase_ref,
+        z_ref,
+        MIN_POSES,
+        a,
+        rms_z,
+        poses,
+        least,
+        most,
+        fit.condition[rows],
     )
     a0, a1, a2 = a
     # zeta = (a0 + a1 s)/(1 + a2 s) with s = phi - r and z = z_ref + zeta, back in the Letter's own
@@ -357,14 +380,28 @@ def _fit_rows(
     c[:, missing] = rms[:, missing] = np.nan
 
 
-@kernel(parallel=True)
+@kernel()
 def _project_onto_plane(  # type: ignore[no-untyped-def]
-    phase, region, px_per_rad, rays, R, t, parameters, row, extent, normal, offset, z, sums
+    first,
+    last,
+    phase,
+    region,
+    px_per_rad,
+    rays,
+    R,
+    t,
+    parameters,
+    row,
+    extent,
+    normal,
+    offset,
+    z,
+    sums,
 ):
     """Fill depths ``z`` and ``sums`` with stereo's points projected along the ``normal`` onto their
     plane."""
     low, high = -0.5 - MARGIN * extent[row], (1.0 + MARGIN) * extent[row] - 0.5
-    for i in prange(phase.shape[0]):
+    for i in range(first, last):
         shift = 0.0  # the neighbour's distortion is a guess that saves a step or two
         for j in range(phase.shape[1]):
             measured = phase[i, j] * px_per_rad
@@ -390,11 +427,11 @@ def _project_onto_plane(  # type: ignore[no-untyped-def]
             a[5] += Y * Y
 
 
-@kernel(parallel=True)
-def _evaluate(phase, ratio, c, phase_min, phase_max, out):  # type: ignore[no-untyped-def]
+@kernel()
+def _evaluate(first, last, phase, ratio, c, phase_min, phase_max, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (h, w, 3) with the points of phases times ``ratio``; NaN too far beyond the
     fitted range."""
-    for v in prange(phase.shape[0]):
+    for v in range(first, last):
         for u in range(phase.shape[1]):
             p = ratio * np.float64(phase[v, u])
             margin = MAX_EXTRAPOLATION * (phase_max[v, u] - phase_min[v, u])
@@ -408,9 +445,21 @@ def _evaluate(phase, ratio, c, phase_min, phase_max, out):  # type: ignore[no-un
             out[v, u, 2] = z
 
 
-@kernel(parallel=True)
+@kernel()
 def fit_rational(
-    phase, z, phase_ref, z_ref, min_poses, coefficients, rms, poses, phase_min, phase_max, condition
+    first,
+    last,
+    phase,
+    z,
+    phase_ref,
+    z_ref,
+    min_poses,
+    coefficients,
+    rms,
+    poses,
+    phase_min,
+    phase_max,
+    condition,
 ):
     """Fit pixels of some rows to their poses: phase (n, h', w) rad and depth z (n, h', w) mm, NaN
     where invalid.
@@ -420,7 +469,7 @@ def fit_rational(
     w) each. First the equation's own residual is minimised, which is linear, ``zeta = a0 + a1 s -
     a2 zeta s``; then one Gauss-Newton step minimises the residual in depth.
     """
-    for v in prange(phase.shape[1]):
+    for v in range(first, last):
         a = np.empty(10)
         for u in range(phase.shape[2]):
             reference = phase_ref[v, u]

@@ -13,11 +13,10 @@ import math
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 
 FloatMap = NDArray[np.float32]
 TILES = (4, 5)
@@ -135,7 +134,17 @@ def estimate_displacement(
     sigma = cv2.resize(blur, phase.shape[::-1], interpolation=cv2.INTER_LINEAR)
     shift, is_continuous = np.empty_like(phase), np.zeros(phase.shape, bool)
     level = np.zeros(phase.shape, np.uint8)
-    _displace(modulation, phase, sigma, np.float32(noise), shift, is_continuous, level)
+    run_rows(
+        _displace,
+        len(phase),
+        modulation,
+        phase,
+        sigma,
+        np.float32(noise),
+        shift,
+        is_continuous,
+        level,
+    )
     factors = _confirm(
         phase, modulation, EdgeDisplacement(shift, is_continuous), level, float(blur.max()), noise
     )
@@ -200,8 +209,8 @@ def _beyond_blur(sigma):
     return int(np.float32(3) * sigma) + 1
 
 
-@kernel(parallel=True)
-def _displace(modulation, phase, sigma, noise, shift, is_continuous, level):
+@kernel()
+def _displace(first, last, modulation, phase, sigma, noise, shift, is_continuous, level):
     """Fill ``shift`` (h, w) with s^2 grad(phi) . grad(ln B) less the part that noise causes,
     ``is_continuous``, and ``level`` with the pixel's place, 0 ... LEVELS - 1, between the dark and
     the bright side of an edge.
@@ -209,7 +218,7 @@ def _displace(modulation, phase, sigma, noise, shift, is_continuous, level):
     Slopes of B are taken over about half a standard deviation, of phi on its brighter side.
     """
     height, width = phase.shape
-    for v in numba.prange(height):
+    for v in range(first, last):
         for u in range(width):
             if not np.isfinite(phase[v, u]):
                 shift[v, u] = np.nan

@@ -18,6 +18,7 @@ from slviewer.fringe.cosines import fit_cosine
 from slviewer.fringe.kernels_light import equalize
 from slviewer.fringe.layout import white_level
 from slviewer.fringe.sequence import Indices, PatternSequence
+from slviewer.geometry.jit import run_rows
 
 Term = Literal["gain", "wave", "room"]
 
@@ -112,7 +113,7 @@ def equalize_frames(
     scale = float(min(256.0, 65000.0 / (highest / gain.min())))
     out = np.empty((len(chosen), *stack.shape[1:]), np.uint16)
     values = [a[chosen].astype(np.float32) for a in (gain, offset, along_rows, along_columns)]
-    equalize(stack, np.array(chosen), *values, albedo, scale, out)
+    run_rows(equalize, stack.shape[1], stack, np.array(chosen), *values, albedo, scale, out)
     for steps in list_shifts(sequence):
         if places := [k for k, i in enumerate(chosen) if i in steps]:
             clipped = reduce(np.maximum, (stack[chosen[k]] for k in places)) >= white

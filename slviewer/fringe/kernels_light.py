@@ -1,22 +1,23 @@
 """Scaling of frames to equal light, compiled."""
 
-import numba
 import numpy as np
 
 from slviewer.geometry.jit import kernel
 
 
-@kernel(parallel=True)
-def equalize(stack, frames, gain, offset, along_rows, along_columns, albedo, scale, out):
+@kernel()
+def equalize(
+    first, last, stack, frames, gain, offset, along_rows, along_columns, albedo, scale, out
+):
     """Fill ``out`` (k, h, w) uint16: frames (k,) of the stack less their room light, over their
     gain, times ``scale``.
 
     ``gain`` (k, h); room light ``offset[k] + albedo (along_rows[k, y] + along_columns[k] (x / (w -
     1) - 0.5))``, with ``albedo`` (h, w), or (0, 0) where there is none in proportion to it.
     """
-    _, height, width = stack.shape
+    width = stack.shape[2]
     per_column = np.float32(1.0 / max(width - 1, 1))
-    for row in numba.prange(height):
+    for row in range(first, last):
         for k in range(len(frames)):
             times = np.float32(scale / gain[k, row])
             added = np.float32(offset[k])

@@ -6,7 +6,6 @@ where ``fold`` is the squared radius (normalised) at which the radial polynomial
 beyond it one pixel belongs to two rays, and nothing past it is ever returned.
 """
 
-import numba
 import numpy as np
 
 from slviewer.geometry.jit import kernel
@@ -89,29 +88,29 @@ def distort_to_px(x, y, parameters):
     return parameters[0] * xd + parameters[2], parameters[1] * yd + parameters[3]
 
 
-@kernel(parallel=True)
-def distort_all(normalised, parameters, pixels):
+@kernel()
+def distort_all(first, last, normalised, parameters, pixels):
     """Fill ``pixels`` (n, 2) from undistorted normalised coordinates (n, 2); NaN at and past the
     fold."""
-    for i in numba.prange(normalised.shape[0]):
+    for i in range(first, last):
         pixels[i, 0], pixels[i, 1] = distort_to_px(normalised[i, 0], normalised[i, 1], parameters)
 
 
-@kernel(parallel=True)
-def undistort_all(pixels, parameters, normalised):
+@kernel()
+def undistort_all(first, last, pixels, parameters, normalised):
     """Fill ``normalised`` (n, 2) with undistorted coordinates of pixels (n, 2); NaN where the
     inversion fails."""
-    for i in numba.prange(pixels.shape[0]):
+    for i in range(first, last):
         xd = (pixels[i, 0] - parameters[2]) / parameters[0]
         yd = (pixels[i, 1] - parameters[3]) / parameters[1]
         normalised[i, 0], normalised[i, 1] = undistort_point(xd, yd, parameters)
 
 
-@kernel(parallel=True)
-def project_all(points, parameters, pixels):
+@kernel()
+def project_all(first, last, points, parameters, pixels):
     """Fill ``pixels`` (n, 2) with projections of points (n, 3) in the lens's frame; NaN behind the
     lens and past the fold."""
-    for i in numba.prange(points.shape[0]):
+    for i in range(first, last):
         z = points[i, 2]
         pixels[i, 0] = np.nan
         pixels[i, 1] = np.nan

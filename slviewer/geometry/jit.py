@@ -23,19 +23,19 @@ from slviewer.geometry.jit_cache import cache_folder
 
 COMPILED: dict[tuple[str, str], None] = {}
 """Names and signatures of the kernels that this process has compiled or loaded, in order."""
+POINTS = 256
+"""So many points are worth a thread of `run_rows`."""
 _LOCK = threading.Lock()
 _SETTINGS: Any = numba.config
 
 
-def kernel(
-    *, parallel: bool = False, fastmath: bool = False
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def kernel(*, fastmath: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator: ``numba.njit`` that releases the GIL and caches its machine code where a folder
     can be written.
 
     Where none can, a kernel is compiled in memory at its first call.
     """
-    options: dict[str, Any] = {"parallel": parallel, "fastmath": fastmath, "nogil": True}
+    options: dict[str, Any] = {"fastmath": fastmath, "nogil": True}
 
     def compile_lazily(function: Callable[..., Any]) -> Callable[..., Any]:
         """Return the function compiled by numba at its first call, with its cache in the module's
@@ -85,9 +85,8 @@ def run_rows(function: Callable[..., Any], rows: int, *arguments: Any, multiple:
     """Call a kernel ``function(first, last, *arguments)`` for ranges of rows that together are
     ``rows``, side by side.
 
-    As many threads work as numba's own parallel loops would use; a parallel function, however,
-    takes the compiler three times as long as a plain one. The ranges begin at multiples of
-    ``multiple``.
+    As many threads work as numba's own parallel loops would use, which take the compiler three
+    times as long. The ranges begin at multiples of ``multiple``.
     """
     blocks = -(-rows // multiple)
     threads = max(1, min(numba.get_num_threads(), blocks))

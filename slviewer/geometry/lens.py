@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.brown import distort_all, fold_radius_squared, project_all, undistort_all
-from slviewer.geometry.jit import read_only
+from slviewer.geometry.jit import POINTS, read_only, run_rows
 
 FOCAL_PX = 1.0, 1e7
 """Focal lengths that a lens may have; the principal point is as near to the image as the
@@ -123,8 +123,8 @@ class Lens:
             raise InputError(
                 f"An array of shape {values.shape} was given: the last dimension must be {last}."
             )
-        mapped = np.empty((*values.shape[:-1], 2))
-        fill(values.reshape(-1, last), self.parameters, mapped.reshape(-1, 2))
+        flat, mapped = values.reshape(-1, last), np.empty((*values.shape[:-1], 2))
+        run_rows(fill, len(flat), flat, self.parameters, mapped.reshape(-1, 2), multiple=POINTS)
         return mapped
 
     def contains(self, pixels: np.ndarray, margin_px: float = 0.0) -> np.ndarray:

@@ -4,12 +4,11 @@ import math
 from collections.abc import Iterable
 from typing import Literal
 
-import numba
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.brown import distort_point
-from slviewer.geometry.jit import kernel, read_only
+from slviewer.geometry.jit import kernel, read_only, run_rows
 from slviewer.geometry.rig import StereoRig
 
 Axis = Literal["x", "y"]
@@ -63,7 +62,11 @@ def depth_per_px(rig: StereoRig, axis: Axis, z: np.ndarray) -> np.ndarray:
     check_map(rig.camera.size, z, "depths")
     slopes = np.empty(np.size(z))
     rays = _as_read_only(rig.camera.rays().reshape(-1, 2))
-    _coordinate_slopes(rays, _as_read_only(np.ravel(z)), *_projector(rig, axis), slopes)
+    depths = _as_read_only(np.ravel(z))
+    run_rows(
+        _coordinate_slopes, len(slopes), rays, depths, *_projector(rig, axis), slopes,
+        multiple=CHUNK,
+    )  # fmt: skip
     with np.errstate(divide="ignore"):
         return np.abs(1.0 / slopes).reshape(np.shape(z))
 
@@ -82,9 +85,10 @@ def _solve(rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Axis)
     """Depths (n,) of rays (n, 2) at projector coordinates (n,)."""
     z = np.empty(len(rays))
     extent = np.array(rig.projector.size, dtype=np.float64)
-    _triangulate_all(
-        _as_read_only(rays), _as_read_only(coordinate), *_projector(rig, axis), extent, z
-    )
+    run_rows(
+        _triangulate_all, len(z), _as_read_only(rays), _as_read_only(coordinate),
+        *_projector(rig, axis), extent, z, multiple=CHUNK,
+    )  # fmt: skip
     return z
 
 
@@ -188,17 +192,17 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
     return _NO_DEPTH
 
 
-@kernel(parallel=True)
-def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
+@kernel()
+def _triangulate_all(first, last, rays, coordinate, R, t, parameters, row, extent, z):
     """Fill ``z`` (n,) mm with the depths of rays (n, 2) at projector coordinates (n,); NaN where
     there is none."""
     size = extent[row]
     low, high = -0.5 - MARGIN * size, (1.0 + MARGIN) * size - 0.5
-    for chunk in numba.prange((coordinate.shape[0] + CHUNK - 1) // CHUNK):
+    for chunk in range(first, last, CHUNK):
         # the neighbour's distortion is a guess that saves a step or two; a chunk's first ray has
         # none
         shift = 0.0
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, coordinate.shape[0])):
+        for i in range(chunk, min(chunk + CHUNK, last)):
             uc, vc, measured = rays[i, 0], rays[i, 1], coordinate[i]
             z[i] = np.nan
             if low <= measured <= high:  # False for NaN
@@ -208,10 +212,10 @@ def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
                 shift = new
 
 
-@kernel(parallel=True)
-def _coordinate_slopes(rays, depths, R, t, parameters, row, slopes):
+@kernel()
+def _coordinate_slopes(first, last, rays, depths, R, t, parameters, row, slopes):
     """Fill ``slopes`` (n,) with d(projector coordinate)/dz in px per mm of rays (n, 2) at depths
     (n,) mm."""
-    for i in numba.prange(depths.shape[0]):
+    for i in range(first, last):
         a0, a1, a2 = _rotate_ray(R, rays[i, 0], rays[i, 1])
         _, _, slopes[i], _, _ = _projection(depths[i], a0, a1, a2, t, parameters, row)

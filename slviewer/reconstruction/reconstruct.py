@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
-import numba
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.vectors import finite_rows
 from slviewer.reconstruction.cloud import Cloud, Map, Points
 
@@ -123,7 +122,7 @@ def normals(points: Points, reach: int = 2) -> Points:
     """
     points = np.ascontiguousarray(points, dtype=np.float32)
     out = np.empty_like(points)
-    _normals(points, reach, out)
+    run_rows(_normals, len(points), points, reach, out)
     return out
 
 
@@ -191,12 +190,12 @@ def _join_axes(axes: Mapping[Axis, PhaseMap] | tuple[Axis, ...]) -> str:
     return " and ".join(sorted(axes)) or "none"
 
 
-@kernel(parallel=True)
-def _normals(points, reach, out):
+@kernel()
+def _normals(first, last, points, reach, out):
     """Per pixel, fits p = p0 + a du + b dv to the window's valid points; the normal is along a x
     b."""
     height, width = points.shape[0], points.shape[1]
-    for y in numba.prange(height):
+    for y in range(first, last):
         for x in range(width):
             out[y, x, 0] = out[y, x, 1] = out[y, x, 2] = np.nan
             z = points[y, x, 2]

@@ -1,7 +1,6 @@
 """One camera frame: light on the surface, through the camera's lens, with noise, to 8 or 16
 bits."""
 
-import numba
 import numpy as np
 from scipy.special import ive, ndtri
 
@@ -9,7 +8,7 @@ from slviewer.geometry.jit import kernel
 from slviewer.simulation.light import OVERSAMPLING
 
 # rows per task: small enough for the cache, large enough that the PSF's overlap costs little
-_ROWS = 24
+ROWS = 24
 
 NORMAL_QUANTILES = ndtri((np.arange(65536) + 0.5) / 65536).astype(np.float32)
 """A standard normal deviate for each 16 random bits."""
@@ -34,21 +33,21 @@ def _hash_bits(x):
     return x
 
 
-@kernel(parallel=True, fastmath=True)
-def image_light(coordinate, level, gain, table, offset, taps, stray, out):
+@kernel(fastmath=True)
+def image_light(first_row, last_row, coordinate, level, gain, table, offset, taps, stray, out):
     """Write the light of one frame into `out` (h, w) float32 grey levels above dark.
 
     Light gain * table(level, coordinate) is blurred by `taps` (2 r + 1) in both directions;
     coordinate, level and gain (h + 2 r, w + 2 r) reach r pixels beyond the frame. `stray` (h, w),
     blurred before, is added.
     """
-    h, w = out.shape
+    w = out.shape[1]
     radius = taps.size // 2
     last = np.float32(table.shape[1] - 1.001)
     start, scale = np.float32(offset), np.float32(OVERSAMPLING)
-    for task in numba.prange((h + _ROWS - 1) // _ROWS):
-        first, end = task * _ROWS, min((task + 1) * _ROWS, h)
-        blurred = np.zeros((_ROWS + 2 * radius, w), np.float32)
+    for first in range(first_row, last_row, ROWS):
+        end = min(first + ROWS, last_row)
+        blurred = np.zeros((ROWS + 2 * radius, w), np.float32)
         line = np.empty(w + 2 * radius, np.float32)
         for k in range(end - first + 2 * radius):
             i = first + k
@@ -76,19 +75,19 @@ def image_light(coordinate, level, gain, table, offset, taps, stray, out):
                     out[i, j] += weight * source[j]
 
 
-@kernel(parallel=True, fastmath=True)
-def digitise(light, noise, top, quantiles, keys, out):
+@kernel(fastmath=True)
+def digitise(first, last, light, noise, top, quantiles, keys, out):
     """Write `light` (h, w) float32 with its noise into `out` (h, w) uint8 or uint16, clipped at 0
     and `top`.
 
     noise: dark level, read variance, shot variance, in units of `out`. The noise depends on the
     pixel and on `keys` (two uint32) alone, not on how the rows are shared among threads.
     """
-    h, w = out.shape
+    w = out.shape[1]
     dark, read, shot = np.float32(noise[0]), np.float32(noise[1]), np.float32(noise[2])
     full = np.float32(top)
     key0, key1 = keys[0], keys[1]
-    for i in numba.prange(h):
+    for i in range(first, last):
         bits = np.empty(w, np.uint32)
         for j in range(w):
             x = _hash_bits(np.uint32(np.uint32(i * w + j) ^ key0))

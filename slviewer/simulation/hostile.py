@@ -15,6 +15,7 @@ import numpy as np
 
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.geometry.jit import run_rows
 from slviewer.simulation import hostile_frames as frame_faults
 from slviewer.simulation import hostile_scenes as scene_faults
 from slviewer.simulation.assets import asset
@@ -157,7 +158,16 @@ def expose_frames(
     signal = np.empty(light.shape, np.uint16)
     for k, frame in enumerate(light):
         frame = frame * np.float32(_SUBLEVELS)
-        digitise(frame, noise, 255.0 * _SUBLEVELS, NORMAL_QUANTILES, keys[k], signal[k])
+        run_rows(
+            digitise,
+            len(frame),
+            frame,
+            noise,
+            255.0 * _SUBLEVELS,
+            NORMAL_QUANTILES,
+            keys[k],
+            signal[k],
+        )
     levels = signal.astype(np.float32) / np.float32(_SUBLEVELS)
     levels = fault.apply("signal", levels, severity, shot)
     frames = np.rint(np.clip(levels, 0, 255)).astype(np.uint8)

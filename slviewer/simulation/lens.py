@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import numba
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import POINTS, kernel, run_rows
 from slviewer.simulation.waves import Waves
 
 
@@ -73,7 +72,9 @@ class SimulatedLens:
         """Values (..., 2) mapped by a compiled kernel with this lens's parameters."""
         numbers = np.array([*self.focal_px, *self.centre_px, *self.brown, self.scale])
         flat = np.ascontiguousarray(values.reshape(-1, 2))
-        return function(flat, numbers, self.waves).reshape(values.shape)
+        mapped = np.empty_like(flat)
+        run_rows(function, len(flat), flat, numbers, self.waves, mapped, multiple=POINTS)
+        return mapped.reshape(values.shape)
 
 
 def _check_shape(values: np.ndarray, last: int) -> np.ndarray:
@@ -124,23 +125,20 @@ def _project_point(x, y, numbers, waves):
     )
 
 
-@kernel(parallel=True)
-def _project_kernel(normalised, numbers, waves):
-    """Pixels (n, 2) at the lens's scale of normalised points (n, 2)."""
-    out = np.empty_like(normalised)
-    for i in numba.prange(normalised.shape[0]):
+@kernel()
+def _project_kernel(first, last, normalised, numbers, waves, out):
+    """Fill ``out`` (n, 2) with the pixels at the lens's scale of normalised points (n, 2)."""
+    for i in range(first, last):
         u, v, _, _, _, _ = _project_point(normalised[i, 0], normalised[i, 1], numbers, waves)
         out[i, 0], out[i, 1] = u, v
-    return out
 
 
-@kernel(parallel=True)
-def _undistort_kernel(pixels, numbers, waves):
-    """Normalised points (n, 2) of pixels (n, 2) by Newton's method; NaN where it does not
-    converge."""
-    out = np.empty_like(pixels)
+@kernel()
+def _undistort_kernel(first, last, pixels, numbers, waves, out):
+    """Fill ``out`` (n, 2) with the normalised points of pixels (n, 2) by Newton's method; NaN where
+    it does not converge."""
     fx, fy, cx, cy, scale = numbers[0], numbers[1], numbers[2], numbers[3], numbers[9]
-    for i in numba.prange(pixels.shape[0]):
+    for i in range(first, last):
         x = ((pixels[i, 0] + 0.5) / scale - 0.5 - cx) / fx
         y = ((pixels[i, 1] + 0.5) / scale - 0.5 - cy) / fy
         error = np.inf
@@ -158,4 +156,3 @@ def _undistort_kernel(pixels, numbers, waves):
             out[i, 0], out[i, 1] = x, y
         else:
             out[i, 0], out[i, 1] = np.nan, np.nan
-    return out

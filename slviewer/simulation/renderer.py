@@ -11,8 +11,9 @@ from slviewer.errors import InputError
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import AXES
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.jit import run_rows
 from slviewer.simulation.concave import ConcaveScene
-from slviewer.simulation.film import NORMAL_QUANTILES, digitise, image_light, psf_taps
+from slviewer.simulation.film import NORMAL_QUANTILES, ROWS, digitise, image_light, psf_taps
 from slviewer.simulation.light import OFFSET, blur_levels, blurred_profile, window
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
@@ -124,7 +125,7 @@ class Renderer:
         noise = np.array(
             [sensor.dark_level, gain**2 * sensor.read_variance, gain * sensor.shot_variance]
         )
-        digitise(light, noise, 255.0, NORMAL_QUANTILES, keys, out)
+        run_rows(digitise, len(out), light, noise, 255.0, NORMAL_QUANTILES, keys, out)
 
     def light(
         self,
@@ -144,9 +145,9 @@ class Renderer:
         light = blurred_profile(light_levels, sigmas)
         width, height = rig.camera.size
         out = np.empty((height, width), np.float32)
-        image_light(
-            maps.coordinates[varies or "x"], maps.level, illuminated,
-            np.float32(lamp) * light, OFFSET, self._taps, stray, out,
+        run_rows(
+            image_light, height, maps.coordinates[varies or "x"], maps.level, illuminated,
+            np.float32(lamp) * light, OFFSET, self._taps, stray, out, multiple=ROWS,
         )  # fmt: skip
         if self._concave:
             indirect = self._indirect_light(varies or "x", (1 - rig.light.black) * light_levels)

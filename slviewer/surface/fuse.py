@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.jit import run_rows
 from slviewer.geometry.rigid import Mask, Uncertainty, distance_jacobian, move_points
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import lengths, rms, unit_vectors
@@ -189,7 +190,16 @@ def _detect_violations(views: Views, pairs: Agreements, progress: Progress) -> d
                 # normal
                 gate = 2.0 * max(_gate_mm(pairs, views, name, other), view.spacing, there.spacing)
                 moved = move_points(T, points)
-                add_votes(moved, gate, there.points, witnesses[other], there.to_pixel, votes)
+                run_rows(
+                    add_votes,
+                    len(moved),
+                    moved,
+                    gate,
+                    there.points,
+                    witnesses[other],
+                    there.to_pixel,
+                    votes,
+                )
         violations[name] = np.zeros(mask.shape, bool)
         violations[name][mask] = votes < 0
     return violations
@@ -240,7 +250,9 @@ def _fuse_scan(
     for other, there in views.items():
         if (name, other) not in pairs and (other, name) not in pairs:
             continue
-        add_surface(
+        run_rows(
+            add_surface,
+            len(points),
             *view.move_into(there, points, normals),
             view.quality[mask],
             np.ascontiguousarray(there.T[:3, :3]),
@@ -308,7 +320,7 @@ def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
     )
     window = max(_WINDOW_SPACINGS * spacing, _WINDOW_SIGMAS * noise)
     heights = np.empty((len(points), 2))
-    measure_heights(points, normals, spacing, window, second.grid, heights)
+    run_rows(measure_heights, len(points), points, normals, spacing, window, second.grid, heights)
     height, overlaps = heights[:, 0], heights[:, 1] >= 0
     if overlaps.sum() < _LEAST_PLACES:
         return None

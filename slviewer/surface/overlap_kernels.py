@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from slviewer.geometry.jit import kernel
@@ -113,30 +112,30 @@ def interpolate_surface(p, n, reach, gate, grid, mean):
     return True
 
 
-@kernel(parallel=True)
-def measure_heights(p, n, reach, gate, grid, heights):
+@kernel()
+def measure_heights(first, last, p, n, reach, gate, grid, heights):
     """Measure the heights of a scan's surface above points ``p`` (k, 3) mm with normals ``n`` (k,
     3) in its frame.
 
     Fills ``heights`` (k, 2): the height in mm and the index of the pixel; (NaN, -1) without
     overlap.
     """
-    for i in numba.prange(len(p)):
+    for i in range(first, last):
         mean = np.empty(8)
         heights[i, 0], heights[i, 1] = np.nan, -1.0
         if interpolate_surface(p[i], n[i], reach, gate, grid, mean):
             heights[i, 0], heights[i, 1] = mean[0], mean[7]
 
 
-@kernel(parallel=True)
-def add_votes(p, gate, points, witnesses, to_pixel, votes):
+@kernel()
+def add_votes(first, last, p, gate, points, witnesses, to_pixel, votes):
     """Add a scan's votes on points ``p`` (k, 3) mm in its frame; only its pixels ``witnesses`` (h,
     w) bool vote.
 
     Adds 1 to ``votes`` (k,) where its surface is within ``gate`` mm in depth, and -1 where the
     surface is more than 1.5 gates behind the point, which is thus in the scan's free space.
     """
-    for i in numba.prange(len(p)):
+    for i in range(first, last):
         y, x = pixel_of(p[i, 0], p[i, 1], p[i, 2], to_pixel, witnesses.shape)
         if y < 0 or not witnesses[y, x]:
             continue
@@ -147,8 +146,10 @@ def add_votes(p, gate, points, witnesses, to_pixel, votes):
             votes[i] -= 1
 
 
-@kernel(parallel=True)
-def add_surface(p, n, own, R, reach, gate, grid, colours, gain, earlier, sums, inferior):
+@kernel()
+def add_surface(
+    first, last, p, n, own, R, reach, gate, grid, colours, gain, earlier, sums, inferior
+):
     """Add a scan's surface to the ``sums`` (k, FIELDS) of points ``p`` (k, 3) with normals ``n``
     (k, 3) in its frame.
 
@@ -157,7 +158,7 @@ def add_surface(p, n, own, R, reach, gate, grid, colours, gain, earlier, sums, i
     one.
     """
     height, width = grid.noise.shape
-    for i in numba.prange(len(p)):
+    for i in range(first, last):
         mean = np.empty(8)
         if not interpolate_surface(p[i], n[i], reach, gate, grid, mean):
             continue

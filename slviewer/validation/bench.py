@@ -21,6 +21,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import multifrequency, p18
 from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import PatternSequence, one_axis
+from slviewer.geometry.jit import run_rows
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.models import load_model, load_stereo
@@ -240,7 +241,7 @@ def _time_with_floor(
     """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as
     `move_bytes` has them."""
     arrays = allocate_floor(frames, numbers, written)
-    seconds, least = time_beside(work, lambda: move_bytes(*arrays), 25)
+    seconds, least = time_beside(work, lambda: run_rows(move_bytes, frames.shape[1], *arrays), 25)
     return seconds, megabytes(*arrays), least
 
 

@@ -11,7 +11,6 @@ from importlib.metadata import PackageNotFoundError, version
 from timeit import repeat, timeit
 
 import numpy as np
-from numba import prange
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.calibration.splined.compiled import DEPTHS, GRID_CELLS_ACROSS, CompiledAxis
@@ -103,15 +102,15 @@ def megabytes(*arrays: np.ndarray) -> float:
     return sum(a.nbytes for a in arrays) / 1e6
 
 
-@kernel(parallel=True)
-def move_bytes(frames, numbers, grey, single, triple):
+@kernel()
+def move_bytes(first, last, frames, numbers, grey, single, triple):
     """Move as many bytes as a decoder does, to measure the memory bandwidth.
 
     Reads ``frames`` (n, h, w) and float32 ``numbers`` (m, h, w) once, and writes ``grey`` (k, h, w)
     of 8 or 16 bits, ``single`` (j, h, w) float32 and ``triple`` (i, h, w, 3) float32.
     """
     width = frames.shape[2]
-    for y in prange(frames.shape[1]):
+    for y in range(first, last):
         whole, broken = np.zeros(width, frames.dtype), np.zeros(width, np.float32)
         for k in range(frames.shape[0]):
             line = frames[k, y]

@@ -6,13 +6,12 @@ noise and what the projector adds evenly everywhere, its second harmonic, which 
 pixels and subtracted.
 """
 
-import numba
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 
 SIGMAS = 5.0
 PART = 0.1
@@ -59,16 +58,18 @@ def mask_motion(
         else 0.0
     )
     few, many = (extreme(len(shift.indices) for shift in shifts) for extreme in (min, max))
-    _mask_moving_pixels(
-        frames, indices, begins, signs, modulation, phase, np.float32(harmonic),
-        np.float32(noise[0]), np.float32(noise[1]),
+    run_rows(
+        _mask_moving_pixels, len(points), frames, indices, begins, signs, modulation, phase,
+        np.float32(harmonic), np.float32(noise[0]), np.float32(noise[1]),
         np.float32(SIGMAS * np.sqrt(1 / few + 1 / many)),
         np.float32(SIGMAS / np.sqrt(len(finest))), np.float32(PART), points,
     )  # fmt: skip
 
 
-@kernel(parallel=True)
+@kernel()
 def _mask_moving_pixels(
+    first,
+    last,
     frames,
     indices,
     begins,
@@ -89,9 +90,9 @@ def _mask_moving_pixels(
     ``mean``, ``alternating``: limits of the two contradictions, in standard deviations of a frame's
     noise.
     """
-    height, width = modulation.shape
+    width = modulation.shape[1]
     groups = len(begins) - 1
-    for row in numba.prange(height):
+    for row in range(first, last):
         lowest, highest = np.empty(width, np.float32), np.empty(width, np.float32)
         total, alternation = np.empty(width, np.float32), np.zeros(width, np.float32)
         for g in range(groups):

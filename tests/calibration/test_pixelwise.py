@@ -147,6 +147,8 @@ def test_moments_find_an_exact_rational_function() -> None:
     )
     reference = np.full((1, 1), 118.0)
     fit_rational(
+        0,
+        1,
         phi.reshape(9, 1, 1),
         z.reshape(9, 1, 1),
         reference,

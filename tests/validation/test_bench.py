@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from facts import missing_facts
 
+from slviewer.geometry.jit import run_rows
 from slviewer.validation import bench_check
 from slviewer.validation.bench import Benchmark, bench
 from slviewer.validation.bench_rows import megabytes, missing, move_bytes, row, time_beside
@@ -22,7 +23,7 @@ def test_the_floor_reads_and_writes_every_byte() -> None:
     grey, single = np.zeros((1, 7, 9), np.uint8), np.zeros((3, 7, 9), np.float32)
     triple = np.zeros((1, 7, 9, 3), np.float32)
     seconds, floor = time_beside(
-        lambda: None, lambda: move_bytes(frames, numbers, grey, single, triple), 3
+        lambda: None, lambda: run_rows(move_bytes, 7, frames, numbers, grey, single, triple), 3
     )
     assert 0 <= seconds < floor
     np.testing.assert_array_equal(grey[0], np.bitwise_xor.reduce(frames))

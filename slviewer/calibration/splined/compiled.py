@@ -75,7 +75,9 @@ class CompiledAxis:
             np.float32,
         )
         phase = np.ascontiguousarray(phase, np.float32)
-        evaluate(phase, numbers, self.coefficients, rays, grid, self.step, out)
+        run_rows(
+            evaluate, len(phase), phase, numbers, self.coefficients, rays, grid, self.step, out
+        )
         return out
 
     def depth_per_px(self, phase: np.ndarray, px_per_rad: float) -> np.ndarray:

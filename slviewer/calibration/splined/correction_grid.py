@@ -2,7 +2,7 @@
 see `compiled`."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from slviewer.geometry.jit import fma, kernel
 from slviewer.geometry.rays import fill_points
@@ -78,15 +78,15 @@ def add_corrections(z, cell, rest, grid, step, row):
                     here[q] += fma(np.float32(q) * per_px, b - a, a)
 
 
-@kernel(parallel=True)
-def evaluate(phase, numbers, c, rays, grid, step, out):
+@kernel()
+def evaluate(first, last, phase, numbers, c, rays, grid, step, out):
     """Fill ``out`` (h, w, 3) mm from phases (h, w), all float32. ``numbers``: px per rad, the
     coordinate's centre px, the grid's first depth mm and its layers per mm; ``c``, ``grid`` and
     ``step`` as `Compiled` has them, ``rays`` (2, h, w)."""
     px_per_rad, centre, near, per_mm = numbers[0], numbers[1], numbers[2], numbers[3]
     one, none = np.float32(1.0), np.float32(np.nan)
     width, deepest = phase.shape[1], np.float32(grid.shape[2] - 1.0001)
-    for v in prange(phase.shape[0]):
+    for v in range(first, last):
         z, rest = np.empty((2, width), np.float32)
         cell = np.empty(width, np.int32)
         for u in range(width):

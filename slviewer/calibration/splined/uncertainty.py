@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numba import prange
 
 from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.unknowns import (
@@ -26,7 +25,7 @@ from slviewer.calibration.splined.unknowns import (
 )
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats, Floats32, Mask, motion_jacobian
 from slviewer.geometry.vectors import rms
 from slviewer.records.calibration import VolumeSigma
@@ -211,7 +210,7 @@ class SigmaMap:
         """
         out = np.empty(points.shape[:2], np.float32)
         z = np.ascontiguousarray(points[..., 2], np.float32)
-        _interpolate(z, np.log(self.nodes), self.near, self.far, out)
+        run_rows(_interpolate, len(z), z, np.log(self.nodes), self.near, self.far, out)
         return out
 
 
@@ -323,8 +322,8 @@ def _select_fitted(bundle: Bundle, volume: Volume) -> Mask:
     return supported if is_enough else np.ones_like(supported)
 
 
-@kernel(parallel=True)
-def _interpolate(z, logs, near, far, out):
+@kernel()
+def _interpolate(first, last, z, logs, near, far, out):
     """Fill ``out`` (h, w) with the exponential of ``logs`` (nv, nu, nz) interpolated linearly at
     depths z (h, w)."""
     height, width = z.shape
@@ -332,7 +331,7 @@ def _interpolate(z, logs, near, far, out):
     per_mm, deepest = np.float32((deep - 1.0) / (far - near)), np.float32(deep - 1.0001)
     start, zero = np.float32(near), np.float32(0.0)
     per_column = np.float32((across - 1.0001) / max(width - 1, 1))
-    for v in prange(height):
+    for v in range(first, last):
         y = v * (down - 1.0001) / max(height - 1, 1)
         j = int(y)
         rest = np.float32(y - j)
