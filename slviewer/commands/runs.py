@@ -211,7 +211,10 @@ def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
             " calibration"
         )
     else:
-        result = call(calibrate, **arguments)
+        from slviewer.geometry.jit_prepare import Preparation
+
+        with Preparation():
+            result = call(calibrate, **arguments)
     data = result.to_json()
     if not options.camera_only:
         terminal.print_result(_summarise_calibration(result))
@@ -266,7 +269,10 @@ def run_reproduce(reproduce: Function, arguments: Arguments) -> None:
         folder = choose_folder(arguments["out"], arguments["quick"])
         terminal.print_result(clean_reproduction(folder))
     else:
-        show_result(reproduce, {**arguments, "say": terminal.print_message})
+        from slviewer.geometry.jit_prepare import Preparation
+
+        with Preparation():
+            show_result(reproduce, {**arguments, "say": terminal.print_message})
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,14 @@ code."""
 
 import os
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -21,8 +22,20 @@ from numba.extending import intrinsic
 
 from slviewer.geometry.jit_cache import cache_folder
 
-COMPILED: dict[tuple[str, str], None] = {}
-"""Names and signatures of the kernels that this process has compiled or loaded, in order."""
+
+class CompiledKernel(NamedTuple):
+    """A kernel, ``module:name``, that was compiled or loaded for arguments of these types, and the
+    seconds of processor time that it took, with what it calls."""
+
+    name: str
+    arguments: tuple[Any, ...]
+    seconds: float
+
+
+COMPILED: list[CompiledKernel] = []
+"""What this process has compiled or loaded, in order, but for what only other kernels called."""
+_CALLERS: list[str] = []
+"""Kernels that are being compiled, each called by the one before."""
 POINTS = 256
 """So many points are worth a thread of `run_rows`."""
 _LOCK = threading.Lock()
@@ -53,13 +66,17 @@ def kernel(*, fastmath: bool = False) -> Callable[[Callable[..., Any]], Callable
                 compiled = numba.njit(cache=True, **options)(function)
             finally:
                 _SETTINGS.CACHE_DIR = before
-        compiled.compile = _compile_once(compiled.compile, folder / f"{function.__qualname__}.lock")
+        lock = folder / f"{function.__qualname__}.lock"
+        name = f"{function.__module__}:{function.__qualname__}"
+        compiled.compile = _compile_once(compiled.compile, name, lock)
         return compiled
 
     return compile_lazily
 
 
-def _compile_once(compile_here: Callable[[Any], Any], path: Path) -> Callable[[Any], Any]:
+def _compile_once(
+    compile_here: Callable[[Any], Any], name: str, path: Path
+) -> Callable[[Any], Any]:
     """Wrap a dispatcher's ``compile(signature)``: what one process compiles, others wait for, and
     load."""
 
@@ -74,8 +91,14 @@ def _compile_once(compile_here: Callable[[Any], Any], path: Path) -> Callable[[A
             with suppress(OSError, NotImplementedError):
                 # of this process, were it forked
                 stack.enter_context(FileLock(path, thread_local=False))
-            compiled = compile_here(signature)
-            COMPILED[path.stem, str(signature)] = None
+            _CALLERS.append(name)
+            begun = time.thread_time()
+            try:
+                compiled = compile_here(signature)
+            finally:
+                _CALLERS.pop()
+            if not _CALLERS:
+                COMPILED.append(CompiledKernel(name, signature, time.thread_time() - begun))
             return compiled
 
     return compile_or_load

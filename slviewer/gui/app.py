@@ -17,6 +17,7 @@ import viser
 from slviewer.devices.browser import PAGE_ROLES, PageChannels
 from slviewer.devices.page_channel import PageState
 from slviewer.errors import SlviewerError, UsageError
+from slviewer.geometry.jit_prepare import Preparation
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.scene import FIELD_OF_VIEW, OVERVIEW
 from slviewer.gui.shell import Shell
@@ -29,7 +30,6 @@ from slviewer.server.viser_internals import ViserClient
 from slviewer.session.recent import RecentSessions, sessions_folder, state_file
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.preparation import Preparation
 from slviewer.wizard.snapshot import Level, Snapshot
 
 DRAWN_PER_S = 10.0

@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from slviewer.geometry.jit_prepare import Preparation
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.records.verification import Verification
@@ -235,7 +236,8 @@ def run_autopilot(session: str, scale: float) -> None:
             first.append(time.perf_counter() - begun)
 
     begun = time.perf_counter()
-    _run_autopilot(Path(session), scale, note, lambda act: None)
+    with Preparation():
+        _run_autopilot(Path(session), scale, note, lambda act: None)
     print(started + first[0], started + time.perf_counter() - begun)
 
 

@@ -18,8 +18,6 @@ threads do the work.
 `steps`               the nine steps, and what each is waiting for
 `snapshot`            what a panel draws; `publisher` builds and publishes it
 `autopilot`           runs the whole wizard on the simulated rig, by the same requests
-`preparation`         compiles the kernels that all this needs, in a process of its own, at the
-                      first start
 ====================  ==============================================================================
 
 Nothing is stored outside of the session's files: a session that is opened again continues where it
