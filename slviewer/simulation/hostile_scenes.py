@@ -218,9 +218,7 @@ def dirty_scene(scene: CleanScene, share: float, number: int) -> Scene:
 def put_on_table(scene: CleanScene, reflectivity: float, number: int) -> Scene:
     """The scene on a polished table 3 mm below the object, which mirrors it."""
     if isinstance(scene, BoardScene):
-        (x, y), (width, height) = scene.corner, scene.plate
-        corners = [(x + a * width, y + b * height, 0.0) for a in (0, 1) for b in (0, 1)]
-        lowest = scene.pose.to_camera(np.array(corners))[:, 1].max()
+        lowest = max(scene.place(a, b)[1] for a in (0, 1) for b in (0, 1))
     else:
         lowest = scene.centres[:, 1].max() + scene.radius_mm
     return MirrorTable(scene, float(lowest) + 3.0, reflectivity)
@@ -229,11 +227,7 @@ def put_on_table(scene: CleanScene, reflectivity: float, number: int) -> Scene:
 def add_second_board(scene: CleanScene, size_mm: float, number: int) -> Scene:
     """The scene with another white plate of this width 70 mm behind the object, to the left of
     it."""
-    if isinstance(scene, BoardScene):
-        (x, y), (width, height) = scene.corner, scene.plate
-        middle = scene.pose.to_camera(np.array([x + width / 2, y + height / 2, 0.0]))
-    else:
-        middle = scene.centres[0]
+    middle = scene.place(0.5, 0.5) if isinstance(scene, BoardScene) else scene.centres[0]
     place = middle + np.array([-0.18 * middle[2], -0.09 * middle[2], 70.0])
     pose = pose_at((5.0, -12.0, 8.0), place)
     return SceneGroup((scene, blank_board(pose, (size_mm, 0.8 * size_mm))))
