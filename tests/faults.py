@@ -234,7 +234,7 @@ def make_seed(folder: Path, poses: int = 7) -> None:
     with Session.open(session, write=True) as store:
         for name in store.capture_names("scan"):
             if name not in ("object_r1", "object_r2", "sphere_1", "sphere_2"):
-                store.trash_capture(name)
+                store.exchange({name: None})
     shutil.rmtree(session / "trash")
     run_sound(calibrate)
     run_sound(["export", str(session), "calibration", "--out", str(folder / "calibration.yml")])

@@ -369,16 +369,11 @@ class BrowserProjector(PageDevice[ProjectorChannel]):
         """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by
         pixel."""
         self._forget_loaded()
+        self._claimed.callback(self._forget_loaded)
+        self._claimed.callback(self._pages.set_light, None)  # the page then shows its marker
         self._pages.set_size(self.size)
         self._pages.page()
         self.show_level(None)
-
-    def close(self) -> None:
-        """Release the page, which then shows its marker."""
-        if self._open:
-            self._pages.set_light(None)
-        self._forget_loaded()
-        super().close()
 
     def load(self, sequence: PatternSequence) -> None:
         """Send all patterns of the sequence, unless the page has them already. Raises InputError or

@@ -17,7 +17,6 @@ from slviewer.devices.drivers import Driver
 from slviewer.devices.gentl import (
     Image,
     Link,
-    ListedCamera,
     NoFrameError,
     as_device_error,
     list_cameras,
@@ -30,6 +29,7 @@ from slviewer.devices.protocols import (
     Channel,
     check_channel,
     check_frame,
+    choose_only,
     extract_channel,
 )
 from slviewer.errors import DeviceError, InputError
@@ -324,7 +324,14 @@ class GenicamCamera(CameraDriver):
     def __post_init__(self) -> None:
         check_channel(self.channel)
         serial = None if self.serial is None else str(self.serial)
-        self._camera = _choose_camera(list_cameras(self.producer), serial, self.model)
+        self._camera = choose_only(
+            list_cameras(self.producer),
+            lambda each: (
+                serial in (None, each.serial)
+                and (self.model is None or self.model.casefold() == each.model.casefold())
+            ),
+            "`serial` number",
+        )
         super().__init__(f"the camera {self._camera}")
         self._first = CameraSettings(self.exposure_ms, self.gain)
         with open_node_map(self._camera) as node_map:
@@ -459,33 +466,6 @@ class GenicamCamera(CameraDriver):
         """Return the features of the open camera."""
         assert self._link
         return Features(self._link.node_map, self.name)
-
-
-def _choose_camera(
-    cameras: list[ListedCamera], serial: str | None, model: str | None
-) -> ListedCamera:
-    """Return the only camera of that serial number and model. Raises InputError or DeviceError with
-    a list."""
-    listed = "; ".join(map(str, cameras))
-    matching = [
-        camera
-        for camera in cameras
-        if serial in (None, camera.serial)
-        and (model is None or model.casefold() == camera.model.casefold())
-    ]
-    if len(matching) == 1:
-        return matching[0]
-    if matching:
-        raise InputError(
-            f"{len(matching)} cameras match ({listed}): choose one by its `serial` number"
-        )
-    if cameras:
-        raise DeviceError(
-            f"no such camera is connected, only {listed}: choose one of them, or plug yours in"
-        )
-    raise DeviceError(
-        "no camera is connected: plug one in, wait until it has started, and close other programs"
-    )
 
 
 def list_genicam_cameras() -> list[str]:

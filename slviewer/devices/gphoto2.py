@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from slviewer.devices.protocols import (
     CameraSettings,
     Channel,
     check_channel,
+    choose_only,
     extract_channel,
 )
 from slviewer.errors import DeviceError, InputError
@@ -236,6 +237,7 @@ class DslrCamera(CameraDriver):
         # a camera that was plugged in again has another port
         self._port = _choose_camera(self._model, self.port)[1]
         link = self._link = _Link(self.name, self._port)
+        self._claimed.callback(link.close)
         link.prepare()
         if self.aperture is not None:
             link.set_nearest("aperture", _APERTURE, self.aperture)
@@ -246,13 +248,6 @@ class DslrCamera(CameraDriver):
                 f"the {what} of {self.name} is automatic: set it at the camera, or in the rig's"
                 " file (exposure_ms, gain)"
             )
-
-    def close(self) -> None:
-        """Release the camera."""
-        super().close()
-        link, self._link = self._link, None
-        if link:
-            link.close()
 
     def _fill(self, out: np.ndarray) -> None:
         extract_channel(self.grab_colour(), self.channel, out)
@@ -296,32 +291,34 @@ class DslrCamera(CameraDriver):
         return self._link
 
 
-def _list_found() -> list[tuple[str, str]]:
-    """List the connected cameras: model and port."""
+class _Found(NamedTuple):
+    """A connected camera."""
+
+    model: str
+    port: str
+
+    def __str__(self) -> str:
+        return " at ".join(self)
+
+
+def _list_found() -> list[_Found]:
+    """List the connected cameras."""
     import gphoto2
 
     with _as_device_error("libgphoto2"):
         found = gphoto2.Camera.autodetect()
-        return [(found.get_name(k), found.get_value(k)) for k in range(found.count())]
+        return [_Found(found.get_name(k), found.get_value(k)) for k in range(found.count())]
 
 
-def _choose_camera(model: str | None, port: str | None) -> tuple[str, str]:
-    """Return model and port of the only camera that fits."""
-    cameras = _list_found()
-    matching = [
-        camera
-        for camera in cameras
-        if (model is None or model.casefold() == camera[0].casefold()) and port in (None, camera[1])
-    ]
-    if len(matching) == 1:
-        return matching[0]
-    listed = "; ".join(map(" at ".join, cameras))
-    if matching:
-        raise InputError(f"{len(matching)} cameras match ({listed}): choose one by its `port`")
-    raise DeviceError(
-        f"no such camera is connected, only {listed}: choose one of them, or plug yours in"
-        if cameras
-        else "no camera is connected: plug one in, switch it on, and disable its power saving"
+def _choose_camera(model: str | None, port: str | None) -> _Found:
+    """Return the only camera that fits."""
+    return choose_only(
+        _list_found(),
+        lambda each: (
+            (model is None or model.casefold() == each.model.casefold())
+            and port in (None, each.port)
+        ),
+        "`port`",
     )
 
 

@@ -9,7 +9,6 @@ knows that it may turn.
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -105,7 +104,7 @@ TIMING = ControllerTiming()
 @dataclass(eq=False)
 class GcodeTurntable(Openable):
     """A turntable on one axis of a GRBL or Marlin controller at a serial port, such as /dev/ttyUSB0
-    or COM3. It is open while its port is.
+    or COM3. It is open while its port is; a motion is stopped by `turn_to` itself.
 
     `degrees_per_unit`: degrees that the table turns for one unit (mm) of the axis, 1 where the
     controller's steps per mm were set to steps per degree; negative to reverse it. `settle_ms`
@@ -163,17 +162,10 @@ class GcodeTurntable(Openable):
                 f"{self.name} cannot be opened ({error}): plug it in, end other programs that use"
                 " it, and check the port; `slviewer devices` lists those that are connected"
             ) from error
+        self._claimed.callback(self._serial.close)
         self._buffer, self._unreadable = b"", 0
         self._probe()
         self.position_deg()  # raises where it is locked
-
-    def close(self) -> None:
-        """Close the port; a motion that was begun is stopped before that by `turn_to`."""
-        super().close()
-        port, self._serial = self._serial, None
-        if port is not None:
-            with suppress(OSError):  # it was unplugged
-                port.close()
 
     def position_deg(self) -> float:
         """Ask the controller for the angle that it counts."""

@@ -30,7 +30,13 @@ from slviewer.devices.dlpc350 import (
     open_hid,
 )
 from slviewer.devices.drivers import Driver
-from slviewer.devices.protocols import Openable, PatternBurst, check_index, check_sequence
+from slviewer.devices.protocols import (
+    Openable,
+    PatternBurst,
+    Projector,
+    check_index,
+    check_sequence,
+)
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -56,25 +62,8 @@ class PackedPicture(NamedTuple):
     rgb: NDArray[np.uint8]
 
 
-class Pictures(Protocol):
+class Pictures(Projector, Protocol):
     """What feeds the video port: a projector that can also play 24-bit pictures."""
-
-    size: tuple[int, int]
-
-    def open(self) -> None:
-        """Claim it, dark."""
-
-    def close(self) -> None:
-        """Release it."""
-
-    def load(self, sequence: PatternSequence) -> None:
-        """Load grey pictures."""
-
-    def show(self, index: int) -> None:
-        """Show a loaded one."""
-
-    def show_level(self, grey: int | None) -> None:
-        """Show even grey."""
 
     def load_pictures(self, pictures: Sequence[PackedPicture]) -> None:
         """Load pictures of 24 bits, in place of a sequence."""

@@ -145,6 +145,7 @@ class PiCamera(CameraDriver):
         in use."""
         with _as_device_error(self.name):
             self._camera, raw = _open_camera(self.number, self._wanted)
+            self._claimed.callback(self._camera.close)
             if (tuple(raw["size"]), raw["format"]) != (self.size, self._format):
                 _describe_stream.cache_clear()
                 raise DeviceError(f"{self.name} is another one than before: choose it anew")
@@ -153,14 +154,6 @@ class PiCamera(CameraDriver):
             self._camera.start()
         self._metadata = {}
         self.apply(self._first)
-
-    def close(self) -> None:
-        """Release the camera."""
-        super().close()
-        camera, self._camera = self._camera, None
-        if camera is not None:
-            with contextlib.suppress(Exception):
-                camera.close()
 
     def _fill(self, out: np.ndarray) -> None:
         samples = self._grab_samples()

@@ -6,9 +6,9 @@ does not answer, is not open or was unplugged; after that, `close` and `open` ar
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args, runtime_checkable
+from typing import Literal, Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
 
@@ -288,11 +288,13 @@ class Turntable(Protocol):
 
 
 class Openable:
-    """A device that works only while it is open; `_start` claims it."""
+    """A device that works only while it is open; `_start` claims it, and leaves in `_claimed` what
+    releases it."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._open = False
+        self._claimed = ExitStack()
 
     def open(self) -> None:
         """Open the device. Raises DeviceError if it is open already, or does not start; it is
@@ -310,7 +312,9 @@ class Openable:
         """Claim the device, which is marked as open already."""
 
     def close(self) -> None:
-        """Close the device; nothing happens when it is not open."""
+        """Close the device; nothing happens when it is not open. Never raises."""
+        with suppress(Exception):  # of a device that was unplugged
+            self._claimed.close()
         self._open = False
 
     def check_open(self) -> None:
@@ -439,6 +443,26 @@ class CameraDriver(Openable):
 
     def _write_settings(self, settings: CameraSettings) -> None:
         pass
+
+
+Listed = TypeVar("Listed")
+
+
+def choose_only(cameras: Sequence[Listed], fits: Callable[[Listed], bool], key: str) -> Listed:
+    """Return the only camera that fits. Raises InputError where several do, to be told apart by
+    ``key``, else DeviceError, with a list."""
+    listed = "; ".join(map(str, cameras))
+    matching = list(filter(fits, cameras))
+    if len(matching) == 1:
+        return matching[0]
+    if matching:
+        raise InputError(f"{len(matching)} cameras match ({listed}): choose one by its {key}")
+    raise DeviceError(
+        f"no such camera is connected, only {listed}: choose one of them, or plug yours in"
+        if cameras
+        else "no camera is connected: plug one in, wait until it has started, disable its power"
+        " saving, and close other programs"
+    )
 
 
 def check_sequence(projector: Projector, sequence: PatternSequence) -> None:

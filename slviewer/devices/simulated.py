@@ -101,15 +101,10 @@ class SimulatedProjector(Openable):
         self._loads, self._shows = 0, 0
 
     def _start(self) -> None:
-        """Start dark, with nothing loaded."""
+        """Start dark, with nothing loaded, and end so."""
         self._sequence = None
         self.show_level(None)
-
-    def close(self) -> None:
-        """Show dark, and close."""
-        if self._open:
-            self.show_level(None)
-        super().close()
+        self._claimed.callback(self.show_level, None)
 
     def load(self, sequence: PatternSequence) -> None:
         """Compute all patterns of a sequence. Raises InputError for an invalid one, or one for

@@ -194,7 +194,7 @@ class SimulatedVideo:
     """The pictures of the video port of a simulated controller, one each refresh."""
 
     def __init__(self, projector: SimulatedProjector, controller: SimulatedDlpc350) -> None:
-        self.size = projector.size
+        self.name, self.size = projector.name, projector.size
         self._projector, self._controller = projector, controller
         self._pictures: Sequence[PackedPicture] = ()
 

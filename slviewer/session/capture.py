@@ -1,6 +1,5 @@
 """A capture: what the projector showed, what the camera saw, and what it is for."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -18,7 +17,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.reading import MOST_REMEMBERED, decoding, identify, read_json
-from slviewer.session.results import Exposure, Size
+from slviewer.session.results import Exposure, Size, digest_bytes
 from slviewer.session.stack import (
     FrameStack,
     check_indices,
@@ -439,13 +438,13 @@ def _hash_content(
 ) -> str:
     """Return the content hash of a capture from that of its frames, its sequence as plain values,
     the rest, and the hash of what its ``second`` camera saw."""
-    whole = hashlib.blake2b(frames_hash.encode() + to_json(described), digest_size=20)
-    if exposures_ms:
-        whole.update(to_json(exposures_ms))
-    if texture is not None:
-        whole.update(np.ascontiguousarray(texture).data)
-    whole.update(second.encode())
-    return whole.hexdigest()
+    return digest_bytes(
+        frames_hash.encode(),
+        to_json(described),
+        to_json(exposures_ms) if exposures_ms else b"",
+        b"" if texture is None else np.ascontiguousarray(texture).data,
+        second.encode(),
+    ).hex()
 
 
 @lru_cache(maxsize=1024)

@@ -5,7 +5,6 @@ written.
 """
 
 import contextlib
-import hashlib
 import json
 import os
 import threading
@@ -21,7 +20,7 @@ from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.names import natural_key, new_name
 from slviewer.session.reading import read_json
 from slviewer.session.report_details import ReportDetails
-from slviewer.session.results import Exposure
+from slviewer.session.results import Exposure, digest_bytes
 
 _Millimetres = Annotated[float, msgspec.Meta(gt=-1e6, lt=1e6)]
 _Triple = tuple[_Millimetres, _Millimetres, _Millimetres]
@@ -142,7 +141,7 @@ class Decisions:
         region = self.decision("region") if name == REGION_INPUT else None
         if not region or not region["on"]:
             return []
-        return [hashlib.blake2b(json.dumps(region).encode(), digest_size=20).hexdigest()]
+        return [digest_bytes(json.dumps(region).encode()).hex()]
 
     def _decide(self, what: str, make: Callable[[], Any]) -> None:
         """Replace a decision by what ``make`` returns, which nobody else changes meanwhile; the

@@ -1,11 +1,11 @@
 """Clouds and meshes as binary PLY: little endian, float32, in mm; complete or absent."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.lib.recfunctions import structured_to_unstructured
 
 from slviewer import __version__
 from slviewer.errors import InputError
@@ -14,7 +14,27 @@ from slviewer.session.atomic import arriving_file
 from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_input
 
 PLACE, NORMAL, COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
-TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
+_WRITTEN_TYPES = {"<f4": "float", "u1": "uchar"}
+_TYPES = {
+    name: code
+    for names, code in {
+        "char int8": "i1",
+        "uchar uint8": "u1",
+        "short int16": "i2",
+        "ushort uint16": "u2",
+        "int int32": "i4",
+        "uint uint32": "u4",
+        "float float32": "f4",
+        "double float64": "f8",
+    }.items()
+    for name in names.split()
+}
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+NO_INDICES = np.empty(0, np.int64)
+PlyProperty = tuple[str, str, str]
+"""Name and type of a property, and for a list the type of its length."""
+PlyRows = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Of each property the values (k,) of all elements, and their number (n,) in each element."""
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
 CHUNK = 1 << 15
 """Points that are packed at a time, in the processor's cache."""
@@ -59,13 +79,14 @@ def write_ply(
     # as groups of plain bytes, which are packed in half of the time
     sizes = [np.dtype(code).itemsize * len(names) for names, code, _ in fields]
     vertex = np.dtype([(f"{i}", f"V{size}") for i, size in enumerate(sizes)])
-    types = {code: name for name, code in TYPES.items()}
     header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm"]
     header += [
         f"comment {to_ascii(note)}" for note in (f"written by slviewer {__version__}", *notes)
     ]
     header.append(f"element vertex {len(points)}")
-    header += [f"property {types[code]} {name}" for names, code, _ in fields for name in names]
+    header += [
+        f"property {_WRITTEN_TYPES[code]} {name}" for names, code, _ in fields for name in names
+    ]
     size = len(points) * vertex.itemsize
     if faces is not None:
         faces = np.asarray(faces)
@@ -96,48 +117,107 @@ def read_ply(path: str | Path) -> Ply:
     """
     path = Path(path)
     data = read_input(path, MAX_CLOUD_BYTES, "check its name.")
-    end = data.find(b"end_header\n")
-    lines = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
-    if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
+    if not data.startswith(b"ply\nformat binary_little_endian 1.0\n"):
         raise InputError(
             f"{path} is not a binary little-endian PLY: only files that slviewer wrote can be read"
             " back."
         )
     with decoding(path, InputError):
-        return _parse_ply(path, data, end, lines[2:])
-
-
-def _parse_ply(path: Path, data: bytes, end: int, lines: list[list[str]]) -> Ply:
-    """Return the content of a PLY from its bytes and the words of its header's ``lines``."""
-    counts: dict[str, int] = {}
-    properties: list[tuple[str, str]] = []
-    for words in lines:
-        if words[0] == "element":
-            counts[words[1]] = int(words[2])
-            if counts[words[1]] < 0:
-                raise ValueError("a negative number of elements")
-        elif words[0] == "property" and list(counts) == ["vertex"] and words[1] in TYPES:
-            properties.append((words[2], TYPES[words[1]]))
-        elif words[0] == "property" and words[1:] != ["list", "uchar", "int", "vertex_indices"]:
-            raise InputError(
-                f"{path} holds '{' '.join(words)}', which slviewer does not write: convert it"
-                " first."
-            )
-    vertex = np.dtype(properties)
-    start = end + len(b"end_header\n")
-    middle = start + counts.get("vertex", 0) * vertex.itemsize
-    if len(data) != middle + counts.get("face", 0) * FACE.itemsize or not set(PLACE) <= set(
-        vertex.names or ()
-    ):
+        _, elements, position = parse_ply_header(data)
+        rows: dict[str, PlyRows] = {}
+        for element, described in elements.items():
+            rows[element], position = read_ply_rows(data, position, *described)
+    vertices = {name: values for name, (values, _) in rows.get("vertex", {}).items()}
+    if position != len(data) or not set(PLACE) <= vertices.keys():
         raise InputError(
-            f"{path} is {len(data)} bytes, not the size in its header: it is truncated, or has"
-            " polygons."
+            f"{path} holds {len(data)} bytes and the properties {', '.join(vertices) or 'none'}: it"
+            " is damaged, or has no points."
         )
-    vertices = np.frombuffer(data[start:middle], dtype=vertex)
-    faces = np.frombuffer(data[middle:], dtype=FACE)
-    if (faces["count"] != 3).any():
+    points, normals, colours = (
+        np.stack([vertices.pop(name) for name in names], axis=1)
+        if set(names) <= vertices.keys()
+        else None
+        for names in (PLACE, NORMAL, COLOURS)
+    )
+    for name, values in vertices.items():
+        if name.startswith("sigma"):
+            values[values == UNKNOWN_SIGMA] = np.nan
+    if normals is not None:
+        normals[~normals.any(axis=1)] = np.nan
+    assert points is not None
+    if "face" not in rows:
+        return Ply(points, colours, normals, vertices)
+    corners, counts = rows["face"].get("vertex_indices", (NO_INDICES, np.ones(1)))
+    if (counts != 3).any():
         raise InputError(f"{path} has faces that are not triangles: triangulate it first.")
-    return _parse_content(vertices, faces["vertices"].copy() if "face" in counts else None)
+    return Ply(points, colours, normals, vertices, corners.reshape(-1, 3))
+
+
+def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, list[PlyProperty]]], int]:
+    """Return the byte order of a PLY ("": it is text), of each element the number and the
+    properties, and where its body begins. Raises ValueError or LookupError for other content."""
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data[:65536])
+    if end is None or not data.startswith(b"ply"):
+        raise ValueError("it has no header of a PLY")
+    order, elements = "", {}
+    properties: list[PlyProperty] = []
+    for words in map(str.split, data[: end.start()].decode("latin-1").splitlines()):
+        if words[:1] == ["format"]:
+            order = _ORDERS[words[1]]
+        elif words[:1] == ["element"]:
+            properties = []
+            elements[words[1]] = int(words[2]), properties
+        elif words[:1] == ["property"]:
+            kinds = [_TYPES[word] for word in words[1:-1] if word != "list"]
+            codes = [order + kind if order else "<f8" for kind in kinds]
+            properties.append((words[-1], codes[-1], codes[0] if len(codes) > 1 else ""))
+    return order, elements, end.end()
+
+
+def read_ply_rows(
+    body: bytes, position: int, count: int, properties: list[PlyProperty]
+) -> tuple[PlyRows, int]:
+    """Return the values of ``count`` elements, and the position after the last. Raises ValueError
+    where the file ends before."""
+    if count < 1:
+        return {name: (np.empty(0, code), NO_INDICES) for name, code, _ in properties}, position
+    first = _walk_ply_rows(body, position, 1, properties)[0]
+    row = np.dtype(
+        [
+            field
+            for name, code, length in properties
+            for field in ([(f"{name}#", length)] if length else [])
+            + [(name, code, (int(first[name][1][0]),))]
+        ]
+    )
+    if position + count * row.itemsize <= len(body):
+        rows = np.frombuffer(body, row, count, position)
+        sizes = {name: row[name].shape[0] for name, _, _ in properties}
+        if all((rows[f"{name}#"] == sizes[name]).all() for name, _, length in properties if length):
+            values = {name: (rows[name].ravel(), np.full(count, n)) for name, n in sizes.items()}
+            return values, position + rows.nbytes
+    return _walk_ply_rows(body, position, count, properties)
+
+
+def _walk_ply_rows(
+    body: bytes, position: int, count: int, properties: list[PlyProperty]
+) -> tuple[PlyRows, int]:
+    """Return what `read_ply_rows` does, element by element, whose lists may differ in length."""
+    values: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in properties}
+    for _ in range(count):
+        for name, code, length in properties:
+            number = 1
+            if length:
+                number = int(np.frombuffer(body, length, 1, position)[0])
+                position += np.dtype(length).itemsize
+            if not 0 <= number <= len(body):
+                raise ValueError(f"a list of {number}")
+            values[name].append(np.frombuffer(body, code, number, position))
+            position += values[name][-1].nbytes
+    return {
+        name: (np.concatenate(parts), np.array([len(part) for part in parts]))
+        for name, parts in values.items()
+    }, position
 
 
 def to_ascii(note: str) -> str:
@@ -163,27 +243,6 @@ def check_faces(faces: np.ndarray, count: int) -> None:
             f"Faces of shape {faces.shape} were given: (m, 3) indices below {count}, the number of"
             " points."
         )
-
-
-def _parse_content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
-    """Return points, colours, normals, scalars and faces from the file's vertex and face
-    records."""
-    names = vertices.dtype.names or ()
-    points, normals, colours = (
-        structured_to_unstructured(vertices[list(fields)], copy=True)
-        if set(fields) <= set(names)
-        else None
-        for fields in (PLACE, NORMAL, COLOURS)
-    )
-    known = {*PLACE, *NORMAL, *COLOURS}
-    scalars = {name: vertices[name].copy() for name in names if name not in known}
-    for name, values in scalars.items():
-        if name.startswith("sigma"):
-            values[values == UNKNOWN_SIGMA] = np.nan
-    assert points is not None
-    if normals is not None:
-        normals[~normals.any(axis=1)] = np.nan
-    return Ply(points, colours, normals, scalars, faces)
 
 
 def _vertex_fields(

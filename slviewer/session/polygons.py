@@ -9,6 +9,7 @@ import numpy as np
 from slviewer.errors import SessionError
 from slviewer.geometry.vectors import lengths
 from slviewer.session.cad import CHORD_MM
+from slviewer.session.ply import NO_INDICES, parse_ply_header, read_ply_rows
 
 MAX_TEXT_BYTES = 1 << 27
 """Of a text file: its numbers need several times its size while they are parsed."""
@@ -17,22 +18,6 @@ MAX_CORNERS = 10_000
 """Of one polygon; and of all that cross themselves, for which clipping ears is slow."""
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER_BYTES = 84
-_PLY_TYPES = {
-    name: code
-    for names, code in {
-        "char int8": "i1",
-        "uchar uint8": "u1",
-        "short int16": "i2",
-        "ushort uint16": "u2",
-        "int int32": "i4",
-        "uint uint32": "u4",
-        "float float32": "f4",
-        "double float64": "f8",
-    }.items()
-    for name in names.split()
-}
-_NONE = np.empty(0, np.int64)
-_PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,22 +208,18 @@ def _read_text_stl(name: str, data: bytes, notes: list[str]) -> Polygons:
 
 def _read_ply(name: str, data: bytes, notes: list[str]) -> Polygons:
     """Return the polygons of a PLY, text or binary."""
-    data = data.removeprefix(codecs.BOM_UTF8)
-    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data[:65536])
-    if end is None or not data.startswith(b"ply"):
-        raise ValueError("it has no header of a PLY")
-    order, elements = _parse_ply_header(data[: end.start()].decode("latin-1"))
+    order, elements, start = parse_ply_header(data := data.removeprefix(codecs.BOM_UTF8))
     count = elements["face"][0] if "face" in elements else 0
     if count > MAX_TRIANGLES:
         raise too_many(name, f"{count:,} triangles")
-    body = data[end.end() :]
+    body = data[start:]
     if not order:  # a text is read as if its numbers were binary
         numbers = _with_points(_to_text(name, body), notes)
         body = np.array(numbers.split(), np.float64).tobytes()
     try:
         rows, position = {}, 0
         for element, (count, properties) in elements.items():
-            rows[element], position = _read_ply_rows(body, position, count, properties)
+            rows[element], position = read_ply_rows(body, position, count, properties)
     except ValueError as error:
         raise SessionError(
             f"{name} is truncated, or damaged: not all of its {count:,} elements of the kind"
@@ -246,75 +227,11 @@ def _read_ply(name: str, data: bytes, notes: list[str]) -> Polygons:
         ) from error
     vertices = np.stack([rows["vertex"][axis][0] for axis in "xyz"], axis=-1).astype(np.float64)
     faces = rows.get("face", {})
-    corners, counts = faces.get("vertex_indices") or faces.get("vertex_index") or (_NONE, _NONE)
+    corners, counts = (
+        faces.get("vertex_indices") or faces.get("vertex_index") or (NO_INDICES, NO_INDICES)
+    )
     _check_counts(name, counts)
     return Polygons(vertices, corners.astype(np.int64), counts.astype(np.int64))
-
-
-def _parse_ply_header(
-    header: str,
-) -> tuple[str, dict[str, tuple[int, list[tuple[str, str, str]]]]]:
-    """Return the byte order of a PLY ("": it is text), and of each element the number and the
-    properties: name, type, and for a list the type of its length."""
-    order, elements = "", {}
-    properties: list[tuple[str, str, str]] = []
-    for words in (line.split() for line in header.splitlines()):
-        if words[:1] == ["format"]:
-            order = _PLY_ORDERS[words[1]]
-        elif words[:1] == ["element"]:
-            properties = []
-            elements[words[1]] = int(words[2]), properties
-        elif words[:1] == ["property"]:
-            kinds = [_PLY_TYPES[word] for word in words[1:-1] if word != "list"]
-            codes = [order + kind if order else "<f8" for kind in kinds]
-            properties.append((words[-1], codes[-1], codes[0] if len(codes) > 1 else ""))
-    return order, elements
-
-
-def _read_ply_rows(
-    body: bytes, position: int, count: int, properties: list[tuple[str, str, str]]
-) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
-    """Return of each property the values (k,) of ``count`` elements and the number of them in each
-    element, and the position after the last. Raises ValueError where the file ends before."""
-    if not count:
-        return {}, position
-    first = _walk_ply_rows(body, position, 1, properties)[0]
-    row = np.dtype(
-        [
-            field
-            for name, code, length in properties
-            for field in ([(f"{name}#", length)] if length else [])
-            + [(name, code, (int(first[name][1][0]),))]
-        ]
-    )
-    if position + count * row.itemsize <= len(body):
-        rows = np.frombuffer(body, row, count, position)
-        sizes = {name: row[name].shape[0] for name, _, _ in properties}
-        if all((rows[f"{name}#"] == sizes[name]).all() for name, _, length in properties if length):
-            values = {name: (rows[name].ravel(), np.full(count, n)) for name, n in sizes.items()}
-            return values, position + rows.nbytes
-    return _walk_ply_rows(body, position, count, properties)
-
-
-def _walk_ply_rows(
-    body: bytes, position: int, count: int, properties: list[tuple[str, str, str]]
-) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
-    """Return what `_read_ply_rows` does, element by element, whose lists may differ in length."""
-    values: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in properties}
-    for _ in range(count):
-        for name, code, length in properties:
-            number = 1
-            if length:
-                number = int(np.frombuffer(body, length, 1, position)[0])
-                position += np.dtype(length).itemsize
-            if not 0 <= number <= len(body):
-                raise ValueError(f"a list of {number}")
-            values[name].append(np.frombuffer(body, code, number, position))
-            position += values[name][-1].nbytes
-    return {
-        name: (np.concatenate(parts), np.array([len(part) for part in parts]))
-        for name, parts in values.items()
-    }, position
 
 
 _READERS = {"stl": _read_stl, "ply": _read_ply, "obj": _read_obj}

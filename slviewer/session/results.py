@@ -343,18 +343,19 @@ def _array_path(folder: Path, name: str) -> Path:
     return folder / _ARRAY_FOLDER / f"{name}.npy"
 
 
-def digest_bytes(data: bytes | memoryview) -> bytes:
-    """Return the digest of bytes, of which content hashes are made."""
-    return hashlib.blake2b(data, digest_size=20).digest()
+def digest_bytes(*parts: bytes | memoryview) -> bytes:
+    """Return the digest of bytes one after another, of which content hashes are made."""
+    whole = hashlib.blake2b(digest_size=20)
+    for part in parts:
+        whole.update(part)
+    return whole.digest()
 
 
 def _combine_digests(meta: Mapping[str, Any], digests: Mapping[str, bytes]) -> str:
     """Return the content hash of a result from its meta and the digests of its arrays in the order
     of their names."""
-    whole = hashlib.blake2b(to_json(dict(meta)), digest_size=20)
-    for name, digest in digests.items():
-        whole.update(name.encode() + digest)
-    return whole.hexdigest()
+    named = (name.encode() + digest for name, digest in digests.items())
+    return digest_bytes(to_json(dict(meta)), *named).hex()
 
 
 def _damage(folder: Path, fault: str) -> DamagedError:

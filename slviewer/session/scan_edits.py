@@ -4,7 +4,6 @@ session's region.
 Results that are made of such points name both as inputs, so that they are stale once one changes.
 """
 
-import hashlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from slviewer.errors import DamagedError, InputError
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.decisions import REGION_INPUT
+from slviewer.session.results import digest_bytes
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import (
@@ -78,16 +78,16 @@ def save_edits(store: Session, scan: str, history: EditHistory) -> None:
             plane = {**to_plain(edit.plane), "normal": list(edit.plane.normal)}
         entry = {"kind": edit.kind, "what": edit.what, "points": edit.points}
         entries.append({**entry, **plane, "made": edit.made})
-    content = hashlib.blake2b(digest_size=20)
+    content = []
     for i, entry in enumerate(entries[: history.applied]):
         used = sorted((key, value) for key, value in entry.items() if key != "made")
-        content.update(repr(used).encode() + arrays.get(str(i), np.zeros(0, np.uint8)).tobytes())
+        content += [repr(used).encode(), arrays.get(str(i), np.zeros(0, np.uint8)).tobytes()]
     meta = {
         "capture": capture.hash,
         "size": list(capture.size),
         "applied": history.applied,
         "edits": entries,
-        "content": content.hexdigest() if history.applied else "",
+        "content": digest_bytes(*content).hex() if content else "",
     }
     store.save_result(f"{FOLDER}/{scan}", meta, arrays)
 

@@ -7,7 +7,6 @@ a black frame. Stacks without checksums, of older sessions, are read too: only `
 tells whether they are damaged.
 """
 
-import hashlib
 import os
 import sys
 from collections.abc import Iterable
@@ -227,7 +226,4 @@ def _to_little_endian(frame: np.ndarray) -> np.ndarray:
 
 def _combine_digests(shape: tuple[int, ...], dtype: np.dtype, digests: list[bytes]) -> str:
     """Return the content hash of a stack from its shape, dtype and the frames' digests."""
-    whole = hashlib.blake2b(f"{shape} {_DTYPES[dtype]}".encode(), digest_size=20)
-    for digest in digests:
-        whole.update(digest)
-    return whole.hexdigest()
+    return digest_bytes(f"{shape} {_DTYPES[dtype]}".encode(), *digests).hex()

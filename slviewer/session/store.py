@@ -282,14 +282,6 @@ class Session(Decisions):
             atomic.commit(folder, target, self._trash_place(target))
         return [self.load_capture(name) for name in staged]
 
-    def trash_capture(self, name: str) -> Path:
-        """Move a capture to the trash folder; returns its place there."""
-        self._require_writer()
-        folder = self.load_capture(name).folder
-        target = self._trash_place(folder)
-        atomic.move(folder, target)
-        return target
-
     def trashed(self) -> list[Trashed]:
         """Return what is in the trash and complete, the last deleted first."""
         return list_trash(self.folder / "trash")

@@ -86,6 +86,11 @@ class BoardScene:
         x, y = (self.board.points[:, :2] + self.misplacement).T
         return np.stack([x, y, self._height(*self._relative(x, y))], 1)
 
+    def place(self, across: float, down: float) -> np.ndarray:
+        """Place (3,) mm in the camera's frame at these shares of the plate's width and height."""
+        (x, y), (width, height) = self.corner, self.plate
+        return self.pose.to_camera(np.array([x + across * width, y + down * height, 0.0]))
+
     def _height(self, X: np.ndarray, Y: np.ndarray) -> np.ndarray:
         """z (...) mm of the plate's surface at X and Y (...), -1 to 1 over the plate."""
         shape = self.shape

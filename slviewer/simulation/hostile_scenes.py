@@ -10,6 +10,7 @@ from slviewer.simulation.boards import BoardScene, BoardShape, Pose, blank_board
 from slviewer.simulation.plans import pose_at, rotation
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import AlteredScene, Points, Rays, Scene, Spheres, Surface
+from slviewer.simulation.second_camera import move_scene, pose_of
 
 Pattern = tuple[Axis | None, np.ndarray]
 """What `fringe.patterns.profile` gives: the axis and the grey levels along it."""
@@ -98,12 +99,8 @@ class MirrorTable(AlteredScene):
 
     def trace(self, rays: Rays) -> Surface:
         """Trace rays to the object, and below it to its mirror image."""
-        surface, scene, (M, shift) = self.scene.trace(rays), self.scene, self.reflection
-        if isinstance(scene, Spheres):
-            mirrored: Scene = replace(scene, centres=scene.centres @ M.T + shift)
-        else:
-            mirrored = replace(scene, pose=Pose(M @ scene.pose.R, M @ scene.pose.t + shift))
-        image = mirrored.trace(rays)
+        surface, pose, (M, shift) = self.scene.trace(rays), pose_of(self.scene), self.reflection
+        image = move_scene(self.scene, Pose(M @ pose.R, M @ pose.t + shift)).trace(rays)
         # The table lies between camera and mirror image, so that the image's points are behind the
         # mirror.
         with np.errstate(invalid="ignore"):
@@ -204,16 +201,12 @@ def flex_board(scene: CleanScene, bow_mm: float, number: int) -> Scene:
 def moving_scenes(scenes: Sequence[CleanScene], by_mm: float) -> list[Scene]:
     """Return eleven copies of the one scene, which moves by `by_mm` mm and turns slightly about its
     own origin, as if held by hand."""
-    (scene,), moved = scenes, list[Scene]()
-    for share in np.linspace(0, 1, 11):
-        way = share * by_mm * np.array([0.7, 0.5, 0.5])
-        turn = share * by_mm * (np.array([0.3, -0.5, 0.2]) / 100)
-        if isinstance(scene, Spheres):
-            moved.append(replace(scene, centres=scene.centres + way))
-        else:
-            pose = Pose(rotation(turn) @ scene.pose.R, scene.pose.t + way)
-            moved.append(replace(scene, pose=pose))
-    return moved
+    (scene,) = scenes
+    pose, way, turn = pose_of(scene), np.array([0.7, 0.5, 0.5]), np.array([0.3, -0.5, 0.2]) / 100
+    return [
+        move_scene(scene, Pose(rotation(moved * turn) @ pose.R, pose.t + moved * way))
+        for moved in np.linspace(0, by_mm, 11)
+    ]
 
 
 def dirty_scene(scene: CleanScene, share: float, number: int) -> Scene:
@@ -225,9 +218,7 @@ def dirty_scene(scene: CleanScene, share: float, number: int) -> Scene:
 def put_on_table(scene: CleanScene, reflectivity: float, number: int) -> Scene:
     """The scene on a polished table 3 mm below the object, which mirrors it."""
     if isinstance(scene, BoardScene):
-        (x, y), (width, height) = scene.corner, scene.plate
-        corners = [(x + a * width, y + b * height, 0.0) for a in (0, 1) for b in (0, 1)]
-        lowest = scene.pose.to_camera(np.array(corners))[:, 1].max()
+        lowest = max(scene.place(a, b)[1] for a in (0, 1) for b in (0, 1))
     else:
         lowest = scene.centres[:, 1].max() + scene.radius_mm
     return MirrorTable(scene, float(lowest) + 3.0, reflectivity)
@@ -236,11 +227,7 @@ def put_on_table(scene: CleanScene, reflectivity: float, number: int) -> Scene:
 def add_second_board(scene: CleanScene, size_mm: float, number: int) -> Scene:
     """The scene with another white plate of this width 70 mm behind the object, to the left of
     it."""
-    if isinstance(scene, BoardScene):
-        (x, y), (width, height) = scene.corner, scene.plate
-        middle = scene.pose.to_camera(np.array([x + width / 2, y + height / 2, 0.0]))
-    else:
-        middle = scene.centres[0]
+    middle = scene.place(0.5, 0.5) if isinstance(scene, BoardScene) else scene.centres[0]
     place = middle + np.array([-0.18 * middle[2], -0.09 * middle[2], 70.0])
     pose = pose_at((5.0, -12.0, 8.0), place)
     return SceneGroup((scene, blank_board(pose, (size_mm, 0.8 * size_mm))))

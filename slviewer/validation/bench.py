@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from timeit import timeit
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,6 @@ from slviewer.validation.bench_live import LiveFigures, live_rate
 from slviewer.validation.bench_rows import (
     PERIOD_PX,
     allocate_floor,
-    fastest,
     fringes_row,
     gpu_rows,
     make_calibrations,
@@ -241,7 +241,8 @@ def _time_with_floor(
     """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as
     `move_bytes` has them."""
     arrays = allocate_floor(frames, numbers, written)
-    seconds, least = time_beside(work, lambda: run_rows(move_bytes, frames.shape[1], *arrays), 25)
+    floor = partial(run_rows, move_bytes, frames.shape[1], *arrays)
+    seconds, least = time_beside(partial(timeit, work, number=1), partial(timeit, floor, number=1))
     return seconds, megabytes(*arrays), least
 
 
@@ -332,7 +333,7 @@ def _time_fit(observations: list[Observation], stereo: StereoModel) -> tuple[flo
             smoothed.append(replace(o, surfaces=surfaces))
         calibrate_pixelwise(smoothed, stereo)
 
-    seconds = fastest(work, 2)
+    seconds = median(work, 2)
     tracemalloc.start()  # NumPy reports its arrays to it
     work()
     held = tracemalloc.get_traced_memory()[1] / 1e9

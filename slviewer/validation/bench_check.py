@@ -23,6 +23,7 @@ from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.validation.bench_rows import (
+    Measure,
     ReliefPair,
     allocate_floor,
     make_calibrations,
@@ -30,6 +31,7 @@ from slviewer.validation.bench_rows import (
     prepare_kernel,
     row,
     run_python,
+    time_beside,
 )
 from slviewer.validation.bench_scaling import save_scans
 from slviewer.validation.proof import track
@@ -49,16 +51,8 @@ LIMITS = {
 }
 """Largest ratio of each stage: 1.5 times what was measured when it was last made faster. Lower a
 limit where its stage became faster; raise one only for what the stage now does more."""
-TIMES = 15
-FEW = 3
-"""Times that a stage is measured at least, ..."""
-LASTING_S = 1.0
-"""... and until it took this long, or `TIMES`."""
 _CLOCK = "import sys, time; {}; print(time.process_time())"
 _COMMAND = "from slviewer.cli import main; main(sys.argv[1:])"
-
-Measure = Callable[[], float]
-"""Does some work once, and returns its seconds."""
 
 
 def check_speed(scale: float, progress: Progress) -> list[Row]:
@@ -73,9 +67,9 @@ def check_speed(scale: float, progress: Progress) -> list[Row]:
         stages = _prepare_stages(scale, Path(folder))
         for stage, (work, unit), _ in track(progress, stages):
             limit = LIMITS[stage]
-            seconds, least = _measure(work, unit)
+            seconds, least = time_beside(work, unit)
             if seconds > limit * least:
-                seconds, least = map(min, (seconds, least), _measure(work, unit))
+                seconds, least = map(min, (seconds, least), time_beside(work, unit))
             target = limit * least, f"at most {limit:g}"
             rows.append(row(stage, seconds, floor=least, target=target))
     return rows
@@ -90,16 +84,6 @@ def _run_on_one_thread() -> Iterator[None]:
         yield
     finally:
         numba.set_num_threads(before)
-
-
-def _measure(work: Measure, unit: Measure) -> tuple[float, float]:
-    """Return least seconds of some work and of its unit, measured in turns."""
-    work(), unit()  # compiled, and in the caches
-    seconds: list[tuple[float, float]] = []
-    while len(seconds) < FEW or (len(seconds) < TIMES and sum(map(sum, seconds)) < LASTING_S):
-        seconds.append((work(), unit()))
-    least, least_unit = map(min, zip(*seconds, strict=True))
-    return least, least_unit
 
 
 def _clock(work: Callable[[], object]) -> Measure:

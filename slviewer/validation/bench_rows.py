@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from timeit import repeat, timeit
+from timeit import repeat
 
 import numpy as np
 
@@ -31,6 +31,14 @@ from slviewer.reconstruction.onepass_cuda import COMPARED, CudaPass
 from slviewer.registration.pairwise import register_prepared
 from slviewer.registration.scan import prepare_scan
 from slviewer.registration.start import Candidate
+
+TIMES = 15
+FEW = 3
+"""Times that a stage is measured at least, ..."""
+LASTING_S = 1.0
+"""... and until it took this long, or `TIMES`."""
+Measure = Callable[[], float]
+"""Does some work once, and returns its seconds."""
 
 
 def row(
@@ -66,15 +74,15 @@ def row(
     }
 
 
-def time_beside(
-    work: Callable[[], object], floor: Callable[[], object], times: int = 9
-) -> tuple[float, float]:
-    """Least seconds of some work and of its floor, run in turns, which lessens the share of other
-    programs."""
-    work(), floor()  # compiled, and in the caches
-    seconds = [(timeit(work, number=1), timeit(floor, number=1)) for _ in range(times)]
-    least, least_floor = map(min, zip(*seconds, strict=True))
-    return least, least_floor
+def time_beside(work: Measure, unit: Measure) -> tuple[float, float]:
+    """Least seconds of some work and of its unit, measured in turns, which lessens the share of
+    other programs."""
+    work(), unit()  # compiled, and in the caches
+    seconds: list[tuple[float, float]] = []
+    while len(seconds) < FEW or (len(seconds) < TIMES and sum(map(sum, seconds)) < LASTING_S):
+        seconds.append((work(), unit()))
+    least, least_unit = map(min, zip(*seconds, strict=True))
+    return least, least_unit
 
 
 def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
@@ -82,12 +90,6 @@ def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
     if warm:
         work()
     return statistics.median(repeat(work, number=1, repeat=times))
-
-
-def fastest(work: Callable[[], object], times: int) -> float:
-    """Least seconds, after a first run that is not counted."""
-    work()
-    return min(repeat(work, number=1, repeat=times))
 
 
 def run_python(*arguments: str, **environment: str) -> str:
@@ -182,7 +184,6 @@ def make_calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledA
     return PixelwiseModel({"x": fit}, {"x": PERIOD_PX}, {}, "x"), compiled, c[3:].astype(np.float32)
 
 
-TIMES = 15
 PERIOD_PX = 18.0
 AHEAD = 8
 """Copies that keep the device busy while what is measured is queued: it then waits for no
@@ -275,7 +276,7 @@ def fringes_row(frames: int, size: tuple[int, int], ours: float) -> Row:
     levels = (
         np.random.default_rng(0).integers(0, 256, (int(coder.T), height, width)).astype(np.uint8)
     )
-    seconds = fastest(lambda: coder.decode(levels), 3)
+    seconds = median(lambda: coder.decode(levels), 3)
     note = (
         f"{seconds / ours:.0f} times our kernel; three periods, coordinates from them, in arrays of"
         " its own"

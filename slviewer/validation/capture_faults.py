@@ -10,6 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
+from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import Axis, Frame, PerAxis
 from slviewer.validation.simulated_capture import (
     AXES,
@@ -20,7 +21,6 @@ from slviewer.validation.simulated_capture import (
     CaptureSetup,
     draw_setup,
     gray_code,
-    pattern_levels,
 )
 
 Rng = np.random.Generator
@@ -72,14 +72,9 @@ def _faulty(
     return FaultyCapture(changed, sound, frozenset(causes), tuple(frames))
 
 
-def _change(*causes: str, is_linear: bool = False, **changes: object) -> Strike:
-    """What only changes some fields of the setup, of a linear projector if that matters."""
-
-    def strike(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-        """The capture with the changes."""
-        return _faulty(replace(setup, gamma=1.0) if is_linear else setup, causes, (), **changes)
-
-    return strike
+def _change(cause: str, **changes: object) -> Strike:
+    """What only changes some fields of the setup."""
+    return lambda setup, rng: _faulty(setup, [cause], (), **changes)
 
 
 def _count(setup: CaptureSetup) -> int:
@@ -105,11 +100,10 @@ def _show(setup: CaptureSetup, instead: Mapping[int, int]) -> tuple[int, ...]:
 
 def _is_same_pattern(setup: CaptureSetup, a: int, b: int) -> bool:
     """Whether two frames show the same, as two bits that are black all over the projector."""
-    first, second = setup.shown.frames[a], setup.shown.frames[b]
-    shown = [pattern_levels(setup.shown, f) for f in (first, second)]
-    if first.axis == second.axis:
-        return bool(np.array_equal(shown[0], shown[1]))
-    return all(np.ptp(levels) == 0 for levels in shown) and shown[0][0] == shown[1][0]
+    (axis, levels), (other_axis, others) = (profile(setup.shown, k) for k in (a, b))
+    if axis == other_axis:
+        return bool(np.array_equal(levels, others))
+    return bool((levels == others[0]).all() and (others == levels[0]).all())
 
 
 def _same_run(setup: CaptureSetup, k: int) -> list[int]:
@@ -211,8 +205,7 @@ def _repeat_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
 
 def _replace_frame(setup: CaptureSetup, rng: Rng, pattern: int) -> FaultyCapture:
     """One frame shows something else."""
-    frames = setup.shown.frames
-    usable = [k for k in _coded(setup) if pattern_levels(setup.shown, frames[k]).any()]
+    usable = [k for k in _coded(setup) if profile(setup.shown, k)[1].any()]
     k = int(rng.choice(usable))
     order = _show(setup, {k: pattern})
     return _faulty(setup, ["duplicate-frame", "frame-order"], [k], order=order)
@@ -383,6 +376,18 @@ def _vary_exposure(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     return _faulty(setup, ["exposure-drift"], gains=tuple(gains.tolist()))
 
 
+def _bend_response(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """A linear projector gets a gamma of 2.2."""
+    return _faulty(replace(setup, gamma=1.0), ["gamma"], gamma=2.2)
+
+
+def _clip_cosine(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """A linear projector shows cosines of mean 40 and amplitude 215, clipped at 0."""
+    levels = np.rint(40 + 215 * np.linspace(-1, 1, 256)).clip(0, 255).astype(int)
+    shown = replace(setup.shown, levels=tuple(levels.tolist()))
+    return _faulty(replace(setup, gamma=1.0), ["gamma", "saturation"], shown=shown)
+
+
 def _switch_lamp(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """A lamp is switched on in the middle, of 30 % of the mean grey level."""
     k = _draw_middle(setup, rng, 0.35, 0.65)
@@ -456,10 +461,8 @@ CAPTURE_FAULTS: Mapping[str, CaptureFault] = {
     "saturated": CaptureFault(_change("saturation", clipped_share=0.3)),
     "dark": CaptureFault(_change("dark", exposure=0.025)),
     # few steps do not average it out
-    "gamma 2.2": CaptureFault(_change("gamma", is_linear=True, gamma=2.2), FEW),
-    "clipped cosine": CaptureFault(
-        _change("gamma", "saturation", is_linear=True, wave=(40.0, 200.0)), PHASE
-    ),
+    "gamma 2.2": CaptureFault(_bend_response, FEW),
+    "clipped cosine": CaptureFault(_clip_cosine, PHASE),
     "moved": CaptureFault(partial(_move, steadily=False)),
     "moving": CaptureFault(partial(_move, steadily=True)),
     "ghosting": CaptureFault(_change("ghosting", ghost=0.15)),

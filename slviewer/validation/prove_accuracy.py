@@ -6,8 +6,7 @@ it happens in memory, one capture after another: a full-size session of so many 
 """
 
 import math
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations
 from statistics import fmean
@@ -44,7 +43,7 @@ from slviewer.simulation.boards import FLAT, BoardShape
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.simulation.scenes import Spheres
+from slviewer.simulation.scenes import Scene, Spheres
 from slviewer.simulation.truth import PerfectModel
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
@@ -75,6 +74,8 @@ GRID = (13, 10, 5)
 """Places where these are compared: columns, rows, depths."""
 
 
+SphereFits = dict[str, tuple[Spheres, Mapping[str, ShapeResult]]]
+"""Of each sphere: what it is, and every model's fit."""
 BENT = BoardShape(bow_x_mm=0.1, bow_y_mm=0.1, twist_mm=0.05, misplaced_mm=0.02)
 
 
@@ -203,17 +204,15 @@ def measure_rig(name: str, rig: SimulatedRig, shape: BoardShape, progress: Progr
         "splined": splined,
         FLOOR: PerfectModel(rig),
     }
-    covered = covered_pixels(observations)
+    compared, spheres = measure_shapes(
+        models,
+        covered_pixels(observations),
+        plan,
+        lambda scene, number: render_phase(Renderer(rig, scene), "scan", number),
+        part(progress, 0.6, 1.0),
+    )
     planes: dict[str, PlaneFigures] = {}
-    spheres: dict[str, tuple[Spheres, Mapping[str, ShapeResult]]] = {}
-    shapes = {key: scene for key, scene in plan.items() if key.startswith(("plane_", "sphere_"))}
-    for key, scene, _ in track(progress, shapes, 0.6, 1.0):
-        phase = render_phase(Renderer(rig, scene), key, list(plan).index(key))
-        if isinstance(scene, Spheres):
-            comparison, _ = compare_fits(models, phase, covered, "sphere")
-            spheres[key] = scene, comparison.results
-            continue
-        comparison, measured = compare_fits(models, phase, covered, "plane")
+    for key, (comparison, measured) in compared.items():
         shares, own = comparison.incidence or {}, comparison.results["splined"]
         planes[key] = PlaneFigures(
             max(shares, key=lambda region: shares[region]),
@@ -222,24 +221,53 @@ def measure_rig(name: str, rig: SimulatedRig, shape: BoardShape, progress: Progr
             own.points,
             measured,
         )
-    radius_error_mm, spacing_error_mm = (defaultdict[str, dict[str, float]](dict) for _ in range(2))
-    for key, (scene, fits) in spheres.items():
-        for model, fit in fits.items():
-            radius_error_mm[model][key] = fit.radius_mm - scene.radius_mm
-    for (a, (first, fits)), (b, (second, others)) in combinations(spheres.items(), 2):
-        true = math.dist(first.centres[0], second.centres[0])
-        for model in [model for model in fits if model in others]:
-            distance = math.dist(fits[model].sphere.centre, others[model].sphere.centre)
-            spacing_error_mm[model][f"{a} - {b}"] = distance - true
     return RigFigures(
         name,
         rig.seed,
         len(rig.camera.waves) > 0,
         planes,
-        radius_error_mm,
-        spacing_error_mm,
+        {
+            model: {
+                key: fits[model].radius_mm - scene.radius_mm
+                for key, (scene, fits) in spheres.items()
+                if model in fits
+            }
+            for model in models
+        },
+        {model: spacing_errors(spheres, model) for model in models},
         perf_counter() - start,
     )
+
+
+def measure_shapes(
+    models: Mapping[str, Model],
+    covered: np.ndarray,
+    plan: Mapping[str, Scene],
+    scan: Callable[[Scene, int], PhaseMap],
+    progress: Progress,
+) -> tuple[dict[str, tuple[Comparison, float]], SphereFits]:
+    """Every model's fits to the planes and spheres of a plan as ``scan(scene, number)`` sees them,
+    and of planes the share of the pixels that splined measures."""
+    shapes = {key: scene for key, scene in plan.items() if key.startswith(("plane_", "sphere_"))}
+    planes, spheres = dict[str, tuple[Comparison, float]](), SphereFits()
+    for key, scene, _ in track(progress, shapes):
+        shape: Shape = "sphere" if isinstance(scene, Spheres) else "plane"
+        found = compare_fits(models, scan(scene, [*plan].index(key)), covered, shape)
+        if isinstance(scene, Spheres):
+            spheres[key] = scene, found[0].results
+        else:
+            planes[key] = found
+    return planes, spheres
+
+
+def spacing_errors(spheres: SphereFits, model: str) -> dict[str, float]:
+    """Errors, mm, of the distances between the centres that a model measures, by their names."""
+    known = [(key, *found) for key, found in spheres.items() if model in found[1]]
+    return {
+        f"{a} - {b}": math.dist(fits[model].sphere.centre, others[model].sphere.centre)
+        - math.dist(first.centres[0], second.centres[0])
+        for (a, first, fits), (b, second, others) in combinations(known, 2)
+    }
 
 
 def covered_pixels(observations: Sequence[Observation]) -> np.ndarray:

@@ -1,17 +1,14 @@
 """Whether two cameras measure at their noise floor, whatever the projector between them does."""
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
 from slviewer.calibration.observe import Observation, observe
-from slviewer.evaluation.fit import Comparison
 from slviewer.fringe.decode import texture
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
@@ -20,21 +17,20 @@ from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.camera_match import epipolar_lines, match_cameras
-from slviewer.reconstruction.reconstruct import Model
-from slviewer.records.verification import Shape
 from slviewer.simulation.plans import letter_plan, rotation
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.simulation.scenes import Scene, Spheres
+from slviewer.simulation.scenes import Scene
 from slviewer.simulation.second_camera import second_camera
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
-from slviewer.validation.prove_accuracy import FLOOR, compare_fits, covered_pixels
+from slviewer.validation.prove_accuracy import FLOOR, covered_pixels, measure_shapes, spacing_errors
 from slviewer.validation.rendered_calibration import (
     calibrate_observed,
     calibrate_rendered,
+    render_phase,
     scan_sequence,
 )
 
@@ -68,15 +64,12 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
 
     def scan_pair(actual: SimulatedRig, scene: Scene, number: int) -> PhaseMap:
         """Return the second camera's columns, as scanned with a rig."""
-        sequence = scan_sequence(rig)
-        seen = decode_both(sequence, capture_both(actual, scene, sequence, number))
-        return match_cameras(*seen, epipolar_lines(own[1]))["x"]
+        phases = scan_both(actual, scene, scan_sequence(rig), number)[1]
+        return match_cameras(*phases, epipolar_lines(own[1]))["x"]
 
     def scan_alone(actual: SimulatedRig, scene: Scene, number: int) -> PhaseMap:
         """Return the projector's columns, as scanned with a rig."""
-        sequence = scan_sequence(rig)
-        frames = Renderer(actual, scene).capture(sequence, number)
-        return decode_frames("scan", sequence, frames)["x"]
+        return render_phase(Renderer(actual, scene), "scan", number)
 
     cases: dict[str, tuple[SimulatedRig, Any, Scan, SimulatedRig]] = {
         "two cameras": (pair, own, scan_pair, rig),
@@ -90,9 +83,15 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
         progress, cases, 0.6, 1.0
     ):
         models = {"stereo": stereo, "splined": splined, FLOOR: PerfectModel(true)}
-        row = measure_shapes(models, covered_pixels(seen), plan, partial(scan, actual), report)
-        rows.append({"rig": name, **row})
-        ratio, spacing = row["splined / floor"], row["worst spacing mm"]
+        planes, spheres = measure_shapes(
+            models, covered_pixels(seen), plan, partial(scan, actual), report
+        )
+        means = {
+            model: fmean(c.results[model].rms_mm for c, _ in planes.values()) for model in models
+        }
+        ratio = means["splined"] / means[FLOOR]
+        spacing = max(map(abs, spacing_errors(spheres, "splined").values()))
+        rows.append({"rig": name, **means, "splined / floor": ratio, "worst spacing mm": spacing})
         if name != "one camera, projector turned":
             checks.append(BandCheck(name, "splined over the floor", ratio, *OVER_FLOOR))
         if "turned" in name and "one" in name:
@@ -103,56 +102,21 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
     return prove_checks(checks, scale, rows, {"rigs": rows}, [title])
 
 
-def capture_both(
+def scan_both(
     rig: SimulatedRig, scene: Scene, sequence: PatternSequence, number: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames (n, h, w) of both cameras; the second one follows from the rig's seed,
-    wherever its projector is."""
+) -> tuple[np.ndarray, tuple[dict[Axis, PhaseMap], dict[Axis, PhaseMap]]]:
+    """Return the first camera's frames (n, h, w), and the phases that both decode; the second one
+    follows from the rig's seed, wherever its projector is."""
     first = Renderer(rig, scene).capture(sequence, number)
-    return first, second_camera(rig).capture(scene, sequence, number)
-
-
-def decode_both(
-    sequence: PatternSequence, frames: tuple[np.ndarray, np.ndarray]
-) -> tuple[dict[Axis, PhaseMap], dict[Axis, PhaseMap]]:
-    """Return the phases that both cameras decode."""
-    first, second = frames
-    return decode_frames("first", sequence, first), decode_frames("second", sequence, second)
+    second = second_camera(rig).capture(scene, sequence, number)
+    return first, (
+        decode_frames("first", sequence, first),
+        decode_frames("second", sequence, second),
+    )
 
 
 def observe_pair(rig: SimulatedRig, scene: Scene, name: str, number: int) -> Observation:
     """The observation of a rendered target pose by both cameras, whose noise ``number`` seeds."""
     sequence, board = p18(rig.projector.size), Board.parse(TARGET)
-    frames = capture_both(rig, scene, sequence, number)
-    matched = match_cameras(*decode_both(sequence, frames))
-    return observe(name, board, detect(board, texture(sequence, frames[0])), matched)
-
-
-def measure_shapes(
-    models: Mapping[str, Model],
-    covered: np.ndarray,
-    plan: Mapping[str, Scene],
-    scan: Callable[[Scene, int], PhaseMap],
-    progress: Progress,
-) -> dict[str, float]:
-    """Return the mean RMS of the planes by model, and the largest error of a spacing of spheres."""
-    shapes = {key: scene for key, scene in plan.items() if key.startswith(("plane_", "sphere_"))}
-    planes, centres = list[Comparison](), dict[str, tuple[Spheres, Comparison]]()
-    for key, scene, _ in track(progress, shapes):
-        shape: Shape = "sphere" if isinstance(scene, Spheres) else "plane"
-        found, _ = compare_fits(models, scan(scene, [*plan].index(key)), covered, shape)
-        if isinstance(scene, Spheres):
-            centres[key] = scene, found
-        else:
-            planes.append(found)
-    means = {name: fmean(each.results[name].rms_mm for each in planes) for name in models}
-    errors = [
-        math.dist(*(each.results["splined"].sphere.centre for each in (one, other)))
-        - math.dist(a.centres[0], b.centres[0])
-        for (a, one), (b, other) in combinations(centres.values(), 2)
-    ]
-    return {
-        **means,
-        "splined / floor": means["splined"] / means[FLOOR],
-        "worst spacing mm": max(map(abs, errors)),
-    }
+    frames, phases = scan_both(rig, scene, sequence, number)
+    return observe(name, board, detect(board, texture(sequence, frames)), match_cameras(*phases))

@@ -14,6 +14,7 @@ from zlib import crc32
 import cv2
 import numpy as np
 
+from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import PRESETS, bits_for, complementary, gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, Size
 from slviewer.simulation.hostile_frames import add_crosstalk, compress_jpeg, row_phase, scale_frames
@@ -50,8 +51,6 @@ LEAST_CONTRAST = {0.5: 0.25, 4.0: 0.5}
 LEAST_STRIPE = 2.5
 """Width of the narrowest stripes of Gray code alone in a sound capture: in camera pixels, and in
 standard deviations of the blur."""
-COSINE = (127.5, 127.5)
-"""Mean and amplitude of the cosines, in grey levels."""
 FEW_STEPS = 4
 """Phase steps up to which a gamma shifts the phase."""
 _TABLE = 8  # entries per projector pixel, of the table of a pattern
@@ -120,8 +119,7 @@ class CaptureSetup:
     the rows. ``room_step``: (image from which on a lamp is on, its light as a share of the mean
     grey level). ``clipped_share`` of the illuminated pixels saturated under white, instead of
     ``exposure``. ``ghost``: share of the image before. ``motion_px`` of the scene in each image,
-    along ``direction``. ``reversed``: axes along which the projector's image is mirrored. ``wave``:
-    mean and amplitude of the cosines, in grey levels clipped to 0 ... 255.
+    along ``direction``. ``reversed``: axes along which the projector's image is mirrored.
     """
 
     kind: CaptureKind
@@ -146,7 +144,6 @@ class CaptureSetup:
     motion_px: tuple[float, ...] = ()
     direction: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reversed: tuple[Axis, ...] = ()
-    wave: tuple[float, float] = COSINE
 
     @property
     def tolerated(self) -> frozenset[str]:
@@ -284,31 +281,10 @@ def render_capture(setup: CaptureSetup) -> SimulatedCapture:
     return SimulatedCapture(stack, truth)
 
 
-def pattern_levels(
-    sequence: PatternSequence, frame: Frame, wave: tuple[float, float] = COSINE
-) -> np.ndarray:
-    """Grey levels (extent,) float64 that the projector shows along the axis of a frame."""
-    if frame.axis is None:
-        return np.full(sequence.projector[0], 0.0 if frame.kind == "black" else 255.0)
-    u = np.arange(sequence.extent(frame.axis), dtype=np.float64)
-    if frame.kind == "phase":
-        turns = u / frame.period_px + sequence.sign(frame.axis) * frame.step / frame.steps
-        angle = 2 * np.pi * turns + sequence.offset_rad(frame.axis)
-        return np.clip(np.floor(wave[0] + wave[1] * np.cos(angle) + 0.5), 0, 255)
-    bits = sum(f.kind == "gray" and f.axis == frame.axis for f in sequence.frames)
-    halves = 2 if frame.kind == "complementary" else 1
-    cells = (u - sequence.origin_px(frame.axis) - 0.5) / sequence.gray_cell(frame.axis)
-    code = np.floor(halves * cells + 1e-9).astype(np.int64)
-    place = 0 if frame.kind == "complementary" else bits - 1 - frame.bit
-    is_white = ((code ^ (code >> 1)) >> place) & 1 == (0 if frame.kind == "inverse" else 1)
-    return np.where(is_white, 255.0, 0.0)
-
-
 def _tabulate_pattern(setup: CaptureSetup, index: int) -> tuple[Axis, np.ndarray]:
     """The axis of a pattern, and its light at each eighth of a projector pixel, 1 for white."""
-    frame = setup.shown.frames[index]
-    axis: Axis = frame.axis or "x"
-    levels = pattern_levels(setup.shown, frame, setup.wave)
+    along, levels = profile(setup.shown, index)
+    axis: Axis = along or "x"
     if axis in setup.reversed:
         levels = levels[::-1]
     light = _DARK_LIGHT + (1 - _DARK_LIGHT) * (levels / 255) ** setup.gamma

@@ -134,7 +134,7 @@ def test_a_number_changed_in_the_page_is_found(
     changed.write_text(text.replace(shown, "99.999", 1))
     emptied = shutil.copytree(folder, tmp_path / "session")
     with Session.open(emptied, write=True) as store:
-        store.trash_capture("sphere_3")  # nothing is computed again then
+        store.exchange({"sphere_3": None})  # nothing is computed again then
     found = verify_report(emptied, changed)
     assert states(found)["page"] == "differs" and "page" in found.failure
 
@@ -168,7 +168,7 @@ def test_other_frames_are_found(
         store.save_capture(
             "plane_01", capture.role, capture.sequence, frames, source="changed", force=True
         )
-        store.trash_capture("sphere_3")
+        store.exchange({"sphere_3": None})
     status, out, error = run("verify-report", folder, certified[1])
     assert status == 1 and not missing_facts(error, "frames of plane_01", "frames of sphere_3")
     assert not missing_facts(out, "frames of plane_01", "frame 8", "frames of sphere_3")

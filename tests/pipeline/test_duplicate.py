@@ -28,7 +28,7 @@ def test_duplicate_has_a_fresh_calibration_and_no_scan(recorded: Path, tmp_path:
         assert available_models(new) == models and new.decision("names") is None
         assert all(new.state_of(f"calibration/{model}") == "fresh" for model in models)
         assert new.load_capture(poses[1]).verify()
-        new.trash_capture(poses[1])
+        new.exchange({poses[1]: None})
     after = read_overview(tmp_path / "bracket-2")
     assert (before.verdict, before.is_calibrated) == (after.verdict, after.is_calibrated)
     assert before.holds.startswith("8 poses, ") and after.holds == "7 poses, 0 scans"

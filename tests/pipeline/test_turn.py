@@ -164,7 +164,7 @@ def test_a_fault_names_its_step_and_the_turn_goes_on_from_there(turned: Turned) 
     assert {"turn2_01", "turn2_02"} <= set(turned.angles())
     # a scan that was deleted is a missing step
     with Session.open(turned.folder, write=True) as store:
-        store.trash_capture("turn1_02")
+        store.exchange({"turn1_02": None})
         assert [step.name for step in missing_steps(store, "turn1")] == ["turn1_02"] and next_turn(
             store
         ) == "turn3"

@@ -258,7 +258,7 @@ def test_a_result_is_stale_when_any_of_its_inputs_is(session, sequence, frames):
         "calibration/stereo", {"inputs": session.input_hashes("pose_1")}, {"K": np.eye(3)}
     )
     assert [session.state_of(name) for name in results] == ["fresh", "stale", "fresh"]
-    session.trash_capture("pose_1")
+    session.exchange({"pose_1": None})
     assert session.state_of("calibration/stereo") == "stale"
     with raises(InputError, "'pose_1'"):
         session.input_hashes("pose_1")
@@ -300,7 +300,7 @@ def test_work_that_was_given_up_saves_nothing(session, sequence, frames):
     for save in (
         lambda: work.save_result("late", {}, {"x": np.ones(2)}),
         lambda: work.decide("target", "other"),
-        lambda: work.trash_capture("a"),
+        lambda: work.exchange({"a": None}),
     ):
         with pytest.raises(Cancelled):
             save()
@@ -336,7 +336,7 @@ except SessionError as error:
         lambda: reader.save_capture("b", "scan", sequence, frames, source=""),
         lambda: reader.save_result("b", {}, {}),
         lambda: reader.exclude("a", "why"),
-        lambda: reader.trash_capture("a"),
+        lambda: reader.exchange({"a": None}),
     ):
         with pytest.raises(SessionError):
             change()

@@ -85,7 +85,7 @@ def test_a_session_is_saved_and_replaced_by_the_rules_of_windows(
         assert (session.load_capture("part").stack() == noise(2)).all()
         session.save_rig("mine", "settle_ms = 1")
         session.save_rig("mine", "settle_ms = 2")
-        session.trash_capture("part")
+        session.exchange({"part": None})
     with Session.open(tmp_path / "session", write=True) as session:
         assert session.capture_names() == []
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import LARGEST_BASELINE_MM
 from slviewer.geometry.rigid import nearest_rotation
 from slviewer.session.importers.filestorage import Storage
@@ -115,21 +116,10 @@ def _list_keys(storage: Storage) -> str:
 
 def _check_intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the camera matrix (3, 3); InputError where it is none, or has skew."""
-    if matrix.shape != (3, 3):
-        raise InputError(f"{where} has shape {matrix.shape}: a camera matrix is 3x3")
-    fx, fy = matrix[0, 0], matrix[1, 1]
-    if (
-        fx <= 0
-        or fy <= 0
-        or not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-9)
-    ):
-        raise InputError(f"{where} is not a camera matrix (fx 0 cx, 0 fy cy, 0 0 1): check the key")
-    if abs(matrix[0, 1]) > 1e-9 * fx:
-        raise InputError(
-            f"{where} has a skew of {matrix[0, 1]:g}, which is not modelled here: calibrate without"
-            " skew"
-        )
-    return matrix
+    try:
+        return Lens(matrix, np.zeros(5), (1, 1)).K
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _check_distortion(matrix: np.ndarray, where: str) -> np.ndarray:

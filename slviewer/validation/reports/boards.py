@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.camera import calibrate_camera
-from slviewer.errors import BoardError, CalibrationRejected
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.measure import measure
 from slviewer.pipeline.simulate import TARGET
@@ -18,14 +17,14 @@ from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 from slviewer.target.corners import opencv_board
 from slviewer.target.detect import Detection, detect
-from slviewer.validation.reports.case import Case, Outcome, Workplace
+from slviewer.validation.reports.case import Case, Outcome, Workplace, read_refusal
 
 _PIXELS_PER_SQUARE = 100
 CENTRE, DIAMETER_MM = np.array([14.0, 6.0, 640.0]), 196.0
 """Of the plan's third sphere."""
 
 
-def _judge_stretch(_: Workplace, x: float, y: float, poses: int = 8) -> Outcome:
+def _judge_stretch(_: Workplace, x: float, y: float) -> Outcome:
     """Calibrate a camera from a board whose print is longer by the shares ``x`` and ``y``, and
     again as the finding says."""
     rig, board = letter(0.5, 0), Board.parse("circles:21x16:9")
@@ -36,7 +35,7 @@ def _judge_stretch(_: Workplace, x: float, y: float, poses: int = 8) -> Outcome:
             rig.camera.project(pose.to_camera(printed)) + rng.normal(0, 0.02, (len(printed), 2)),
             np.arange(len(printed)),
         )
-        for i, pose in enumerate(target_poses(rig, board, poses))
+        for i, pose in enumerate(target_poses(rig, board, 8))
     }
     first = calibrate_camera(board, seen, rig.camera.size)
     findings = [f for f in first.verdict.findings if f.cause == "board-size"]
@@ -73,11 +72,7 @@ def _judge_picture(
         cv2.warpPerspective(sheet, H, (1280, 960), borderValue=235), (0, 0), 0.9
     )
     shown = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-    try:
-        detect(Board.parse(given), shown)
-        return Outcome("detected", right, False)
-    except BoardError as error:
-        message = str(error)
+    message = read_refusal(lambda: detect(Board.parse(given), shown), "detected")
     found = detect(board, image)
     points = board.points[found.ids][:, :2] / board.pitches + 1
     true = cv2.perspectiveTransform(points[None] * _PIXELS_PER_SQUARE - 0.5, H.astype(float))[0]
@@ -92,7 +87,6 @@ def _judge_mirrored(
     """Calibrate from camera images that are flipped, which is refused by naming both devices; then,
     as the remedy says, without the flip, and measure a sphere."""
     base, folder = workplace.base(), workplace.folder / "flipped"
-    said = "calibrated"
     with Session.open(base) as old, Session.create(folder) as new:
         for role in ("calibration", "scan"):
             captures = [
@@ -103,10 +97,7 @@ def _judge_mirrored(
                 for c in captures
             ]
             new.save_captures(flipped, role, board=TARGET if role == "calibration" else None)
-    try:
-        calibrate(folder, target=TARGET)
-    except CalibrationRejected as error:
-        said = str(error)
+    said = read_refusal(lambda: calibrate(folder, target=TARGET), "calibrated")
     x, y, z = CENTRE if is_mirror else -CENTRE
     ball, session = (x, y, abs(z), DIAMETER_MM / 2 + 3), base if is_mirror else folder
     diameter = measure(session, "sphere_3", "sphere", ball=ball).only["diameter"]

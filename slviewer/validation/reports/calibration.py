@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.errors import CalibrationRejected, InputError
+from slviewer.errors import CalibrationRejected
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.lens import Lens
@@ -29,7 +29,7 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import sphere
 from slviewer.simulation.truth import rig_record
 from slviewer.target.board import Board
-from slviewer.validation.reports.case import BASE_SCALE, Case, Outcome, Workplace
+from slviewer.validation.reports.case import BASE_SCALE, Case, Outcome, Workplace, read_refusal
 
 _RIG = letter(BASE_SCALE, 0)
 _FOCAL = {device: rig_record(_RIG)[device]["K"][0][0] for device in ("camera", "projector")}
@@ -152,11 +152,7 @@ def _cropped(workplace: Workplace) -> Outcome:
     width, height = _RIG.camera.size
     lens = Lens.from_parameters((_FOCAL["camera"],) * 2 + (width / 2, 112.0), (width, 225))
     file = _write_lens(workplace.folder / "cropped.yml", lens)
-    try:
-        _calibrate(workplace.base(), file, True)
-        measured = "accepted"
-    except InputError as error:
-        measured = str(error)
+    measured = read_refusal(lambda: _calibrate(workplace.base(), file, True), "accepted")
     sizes = f"{width}x225 px", f"{width}x{height} px"
     return Outcome(measured, f"refused: {' and '.join(sizes)}", all(s in measured for s in sizes))
 

@@ -49,7 +49,7 @@ def _judge_clipping(
     a level of its own."""
     sequence = complementary((720, 720), steps=4)
     sequence = replace(sequence, frames=tuple(f for f in sequence.frames if f.axis == "x"))
-    levels = np.stack([_draw(sequence, k) for k in range(len(sequence.frames))])
+    levels = np.stack([profile(sequence, k)[1] for k in range(len(sequence.frames))])
     light, columns = _photograph(levels, brightness, 10.0)
     if share:
         light[:, :, : int(share * WIDTH)] *= 2.0
@@ -68,12 +68,6 @@ def _judge_clipping(
         f"{100 * crossed:.1f} % are clipped at {clip}; 0.30 px at most without them",
         abs(masked - crossed) < 0.02 and error < 0.3 and warned == (crossed > 0.05),
     )
-
-
-def _draw(sequence: PatternSequence, k: int) -> np.ndarray:
-    """Return the grey levels (extent,) of a pattern along x."""
-    levels = profile(sequence, k)[1]
-    return np.broadcast_to(levels.astype(float), (sequence.projector[0],))
 
 
 def _judge_cells(
@@ -121,11 +115,6 @@ def _judge_cells(
     )
 
 
-def _number_cells(columns: np.ndarray, cell_px: int) -> np.ndarray:
-    """Return the cells of a whole width."""
-    return columns // cell_px
-
-
 def _number_rounded(columns: np.ndarray, period_px: float) -> np.ndarray:
     """Return the cells whose edges are those of the periods, each rounded to a whole pixel."""
     edges = np.floor(np.arange(1, 100) * period_px + 0.5)
@@ -134,9 +123,12 @@ def _number_rounded(columns: np.ndarray, period_px: float) -> np.ndarray:
 
 def _cells(extent: int, period_px: float, cell_px: int, offset_rad: float = 0.0) -> Case:
     """Return the case of cells of a whole width."""
-    edge = partial(_number_cells, cell_px=cell_px)
     return partial(
-        _judge_cells, extent=extent, period_px=period_px, edge=edge, offset_rad=offset_rad
+        _judge_cells,
+        extent=extent,
+        period_px=period_px,
+        edge=lambda columns: columns // cell_px,
+        offset_rad=offset_rad,
     )
 
 

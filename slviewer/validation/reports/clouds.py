@@ -9,7 +9,6 @@ import numpy as np
 import trimesh
 
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.errors import InputError
 from slviewer.geometry.rigid import (
     fit_rigid,
     move_points,
@@ -27,7 +26,7 @@ from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.simulate import TRUTH
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
-from slviewer.validation.reports.case import Case, Outcome, Workplace
+from slviewer.validation.reports.case import Case, Outcome, Workplace, read_refusal
 
 _RADIUS, _CENTRE, _NOISE = 25.0, np.array([12.0, -7.0, 300.0]), 0.02
 _TOO_HIGH = 0.3
@@ -36,10 +35,10 @@ _MOVED = turn_about(np.array([0.4, 1.1, -0.7]), np.zeros(3), np.array([-30.0, 80
 """T_file_camera of a file whose coordinates are other than its camera's."""
 
 
-def _ball(count: int = 20_000) -> np.ndarray:
+def _ball() -> np.ndarray:
     """Return the noisy points (n, 3) mm of a sphere that are seen from the origin."""
     rng = np.random.default_rng(3)
-    out = rng.normal(size=(count, 3))
+    out = rng.normal(size=(20_000, 3))
     out /= np.linalg.norm(out, axis=1)[:, None]
     out = out[out @ _CENTRE < -0.3 * np.linalg.norm(_CENTRE)]
     return _CENTRE + (_RADIUS + _NOISE * rng.normal(size=(len(out), 1))) * out
@@ -159,13 +158,10 @@ def _reconstruct_imported(at: Workplace) -> Outcome:
     """Ask for what needs frames, and follow what is answered."""
     np.savetxt(at.folder / "ball.xyz", _ball(), "%.4f")
     import_cloud(at.folder / "session", [at.folder / "ball.xyz"])
-    try:
-        reconstruct(at.folder / "session", "ball")
-    except InputError as error:
-        named = "imported as a cloud" in str(error) and "measure" in str(error)
-        followed = _measure_ball("again.ply", write_ply, at)
-        return Outcome(f"{error} {followed.measured}", followed.truth, named and followed.holds)
-    return Outcome("reconstructed", "it has no frames", False)
+    said = read_refusal(lambda: reconstruct(at.folder / "session", "ball"), "reconstructed")
+    named = "imported as a cloud" in said and "measure" in said
+    followed = _measure_ball("again.ply", write_ply, at)
+    return Outcome(f"{said} {followed.measured}", followed.truth, named and followed.holds)
 
 
 def _write_metres(path: Path, points: np.ndarray) -> None:

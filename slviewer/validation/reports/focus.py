@@ -1,22 +1,18 @@
 """A rig that changed after its calibration."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.accept import check
 from slviewer.pipeline.measure import measure
 from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct, verify
 from slviewer.pipeline.simulate import TARGET
 from slviewer.records.measurement import Measurement
 from slviewer.session.store import Session
+from slviewer.simulation.decals import cylinder_mesh
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import letter_plan, pose_at, rotation
-from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Rays, Scene, Spheres, Surface, directions_of
 from slviewer.target.board import Board
@@ -58,34 +54,9 @@ class LobedSphere(Spheres):
         return surface
 
 
-def _cylinder() -> MeshScene:
-    """Return an upright half cylinder that faces the camera."""
-    angles, heights = np.linspace(-1.4, 1.4, 241), np.linspace(-60, 60, 25)
-    t, h = (each.ravel() for each in np.meshgrid(angles, heights))
-    vertices = np.column_stack([RADIUS_MM * np.sin(t), h, -RADIUS_MM * np.cos(t)])
-    a = np.arange(len(t)).reshape(25, 241)
-    one, two, three, four = (
-        each.ravel() for each in (a[:-1, :-1], a[:-1, 1:], a[1:, :-1], a[1:, 1:])
-    )
-    triangles = np.vstack([np.column_stack([one, three, two]), np.column_stack([two, three, four])])
-    return MeshScene(vertices, triangles, pose_at((0, 0, 0), CENTRE))
-
-
 TURNED = replace(_RIG, R=_RIG.R @ rotation(np.array([0.0, -1e-3, 0.0])))
 SPHERE = Spheres(np.array([CENTRE]), DIAMETER_MM / 2)
 LOBED = LobedSphere(np.array([CENTRE]), DIAMETER_MM / 2)
-
-
-def _capture(place: Workplace, rig: SimulatedRig, scene: Scene, axes: str, role: Any) -> Path:
-    """Return a calibrated session with a capture "shot" of a scene by a rig."""
-    session, sequence = place.base(), p18(rig.projector.size)
-    if axes != "xy":
-        sequence = one_axis(sequence, "x")
-    frames = Renderer(rig, scene).capture(sequence, 77)
-    board = Board.parse(TARGET) if role == "calibration" else None
-    with Session.open(session, write=True) as store:
-        store.save_capture("shot", role, sequence, frames, board=board)
-    return session
 
 
 def _describe(measured: Measurement, name: str, true_mm: float) -> tuple[str, bool, bool]:
@@ -104,7 +75,7 @@ def _measure_sphere(
     """Return the case of a sphere that is measured with the splined model."""
 
     def case(place: Workplace) -> Outcome:
-        session = _capture(place, rig, scene, axes, "scan")
+        session = place.capture(rig, {"shot": scene}, 77, axes)
         ball = (*CENTRE, DIAMETER_MM / 2 + 3)
         measured = measure(session, "shot", "sphere", ball=ball, model="splined").only
         text, covers, doubted = _describe(measured, "diameter", DIAMETER_MM)
@@ -116,7 +87,8 @@ def _measure_sphere(
 
 
 def _measure_cylinder(place: Workplace) -> Outcome:
-    session = _capture(place, _refocus("camera", 5e-3), _cylinder(), "x", "scan")
+    cylinder = MeshScene(*cylinder_mesh(RADIUS_MM, 120.0), pose_at((0, 0, 0), CENTRE))
+    session = place.capture(_refocus("camera", 5e-3), {"shot": cylinder}, 77)
     ball = (*CENTRE[:2], CENTRE[2] - RADIUS_MM, 50.0)
     measured = measure(session, "shot", "cylinder", ball=ball, model="splined").only
     text, covers, doubted = _describe(measured, "diameter", 2 * RADIUS_MM)
@@ -125,7 +97,7 @@ def _measure_cylinder(place: Workplace) -> Outcome:
 
 def _verify_plane(place: Workplace) -> Outcome:
     plane = letter_plan(_RIG, poses=3)["plane_04"]
-    session = _capture(place, _refocus("projector", 5e-3), plane, "x", "scan")
+    session = place.capture(_refocus("projector", 5e-3), {"shot": plane}, 77)
     verified = verify(session, ["shot"], "plane").only
     text = verified.warnings[0] if verified.warnings else "no finding"
     return Outcome(text, "a flat plane, and a finding", "calibration" in text)
@@ -134,7 +106,7 @@ def _verify_plane(place: Workplace) -> Outcome:
 def _check_board(place: Workplace) -> Outcome:
     """Follow the remedy: check the calibration with a new pose of its board."""
     board = letter_plan(_RIG, poses=9)["pose_05"]
-    session = _capture(place, _refocus("camera", 5e-3), board, "xy", "calibration")
+    session = place.capture(_refocus("camera", 5e-3), {"shot": board}, 77, "xy", "calibration")
     found = check(session, "shot").only
     return Outcome(found.verdict, "no longer good", not found.is_good)
 

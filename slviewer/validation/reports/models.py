@@ -8,9 +8,8 @@ from functools import partial
 import numpy as np
 import trimesh
 
-from slviewer.errors import SessionError
 from slviewer.session.nominal import read_nominal
-from slviewer.validation.reports.case import Case, Outcome, Workplace
+from slviewer.validation.reports.case import Case, Outcome, Workplace, read_refusal
 
 _U = [(12, 9), (8, 9), (8, 5), (4, 5), (4, 9), (0, 9), (0, 0), (12, 0)]
 """Outline of a prism, anticlockwise: a slot in its upper side."""
@@ -102,10 +101,7 @@ def _read(name: str, content: bytes, volume: float, bodies: int, place: Workplac
 def _refuse(name: str, content: bytes, fact: str, place: Workplace) -> Outcome:
     """Read a model that must be refused with ``fact`` in its reason."""
     (path := place.folder / name).write_bytes(content)
-    try:
-        said = f"read as {read_nominal(path).text()}"
-    except SessionError as error:
-        said = str(error)
+    said = read_refusal(lambda: read_nominal(path), "read")
     return Outcome(said, f"refused: {fact}", fact in said and "export" in said)
 
 

@@ -1,13 +1,13 @@
 """Scans aligned and judged against models."""
 
 from collections.abc import Callable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.rigid import move_points, rigid_transform
 from slviewer.pipeline.compare import compare
 from slviewer.pipeline.measured_surface import load_surface
@@ -20,7 +20,7 @@ from slviewer.registration.markers import MeasuredMarkers
 from slviewer.registration.multiway import Starts
 from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import register_object
-from slviewer.session.capture import NewCapture
+from slviewer.session.polygons import Polygons, triangulate_polygons
 from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import MeshScene
@@ -46,15 +46,11 @@ BLOCK = Pose(
 
 def _box(low: tuple[float, ...], high: tuple[float, ...]) -> Any:
     """Return a box between two corners, mm."""
-    import trimesh
-
     return trimesh.creation.box(bounds=(low, high))
 
 
 def _block(with_slot: bool) -> Any:
     """Return a block of 120 x 90 mm with three bosses, and a slot on 15 % of its upper face."""
-    import trimesh
-
     bosses = [
         _box((10, 10, HEIGHT - 1), (30, 25, HEIGHT + 12)),
         _box((70, 8, HEIGHT - 1), (85, 30, HEIGHT + 7)),
@@ -62,26 +58,27 @@ def _block(with_slot: bool) -> Any:
     ]
     body = _box((0, 0, 0), (120, 90, HEIGHT))
     if with_slot:
-        low = HEIGHT - DEPTH
-        outline = [(120, 90), (80, 90), (80, 50), (40, 50), (40, 90), (0, 90), (0, 0), (120, 0)]
-        vertices = [(x, y, HEIGHT) for x, y in outline]
-        vertices += [(80, 90, low), (80, 50, low), (40, 50, low), (40, 90, low)]
-        vertices += [(0, 0, 0), (120, 0, 0), (120, 90, 0), (0, 90, 0)]
-        face = [(0, 1, 2), (0, 2, 7), (2, 3, 7), (3, 6, 7), (3, 4, 5), (3, 5, 6)]
-        slot = [(8, 11, 10), (8, 10, 9), (1, 8, 9), (1, 9, 2), (2, 9, 10), (2, 10, 3), (3, 10, 11)]
-        slot += [(3, 11, 4)]
-        back = [(15, 5, 11), (5, 4, 11), (15, 11, 14), (11, 8, 14), (8, 0, 14), (8, 1, 0)]
-        rest = [(12, 15, 14), (12, 14, 13), (6, 12, 13), (6, 13, 7), (7, 13, 14), (7, 14, 0)]
-        rest += [(5, 15, 12), (5, 12, 6)]
-        body = trimesh.Trimesh(vertices, face + slot + back + rest, process=False)
+        slot = [(80, 90), (80, 50), (40, 50), (40, 90)]
+        bottom = [(0, 0), (120, 0), (120, 90), (0, 90)]
+        vertices = [(x, y, HEIGHT) for x, y in [(120, 90), *slot, (0, 90), (0, 0), (120, 0)]]
+        vertices += [(x, y, HEIGHT - DEPTH) for x, y in slot]
+        vertices += [(x, y, 0) for x, y in bottom]
+        sides = [
+            range(8), range(8, 12), range(15, 11, -1), (1, 8, 9, 2), (2, 9, 10, 3), (3, 10, 11, 4),
+            (15, 5, 4, 11, 8, 1, 0, 14), (6, 12, 13, 7), (7, 13, 14, 0), (5, 15, 12, 6),
+        ]  # fmt: skip
+        polygons = Polygons(
+            np.array(vertices, float),
+            np.concatenate(sides),
+            np.array([len(side) for side in sides]),
+        )
+        body = trimesh.Trimesh(vertices, triangulate_polygons(polygons, []), process=False)
         body.fix_normals()
     return trimesh.util.concatenate([body, *bosses])
 
 
 def _studs(with_lug: bool) -> Any:
     """Return a plate larger than the view with a stud every `PITCH` mm, and a lug 3 mm wide."""
-    import trimesh
-
     bodies = [_box((-350, -350, -10), (350, 350, 0))]
     for x, y in np.stack(np.meshgrid(np.arange(-8, 9), np.arange(-8, 9)), -1).reshape(-1, 2):
         stud = trimesh.creation.cylinder(7, 8, sections=24)
@@ -91,8 +88,6 @@ def _studs(with_lug: bool) -> Any:
 
 def _nut() -> Any:
     """Return a hexagonal nut of 40 mm with a bore."""
-    import trimesh
-
     around = np.arange(48) * np.pi / 24
     apart = (around + np.pi / 6) % (np.pi / 3) - np.pi / 6
     circle = np.stack([np.cos(around), np.sin(around)], axis=1)
@@ -133,19 +128,8 @@ def _scenes() -> Mapping[str, Callable[[], MeshScene]]:
 
 def _scan(workplace: Workplace, *names: str) -> Path:
     """Return a calibrated session with these scans."""
-    session, scenes = workplace.base(), _scenes()
-    sequence = one_axis(p18(RIG.projector.size), "x")
-    with Session.open(session, write=True) as store:
-        store.save_captures(
-            [
-                NewCapture(
-                    name, sequence, Renderer(RIG, scenes[name]()).capture(sequence, k), None, ""
-                )
-                for k, name in enumerate(names)
-            ],
-            "scan",
-        )
-    return session
+    scenes = _scenes()
+    return workplace.capture(RIG, {name: scenes[name]() for name in names})
 
 
 def _merge(session: Path, scan: str, onto: str, **options: Any) -> tuple[Merge, list[str]]:
@@ -331,19 +315,14 @@ def _judge_offset(workplace: Workplace) -> Outcome:
 
 def _measure_thin(workplace: Workplace) -> Outcome:
     """A plate between octagonal posts with markers all around, from both sides: its thickness."""
-    import trimesh
-
-    posts, corners, facing = [], list[np.ndarray](), list[np.ndarray]()
-    for x in (-65.0, 65.0):
-        post = trimesh.creation.cylinder(24 / np.cos(np.pi / 8), 120, sections=8)
-        posts.append(post.apply_transform(_turn(np.pi / 8, 2)).apply_transform(_turn(np.pi / 2, 0)))
-        post.apply_translation((x, 0, 0))
-        for angle in np.arange(8) * np.pi / 4:
-            R = rotation(np.array([0, angle, 0]))
-            for y in (-40.0, 0.0, 40.0):
-                square = np.array([[-7.0, -7, -24], [7, -7, -24], [7, 7, -24], [-7, 7, -24]])
-                corners.append(square @ R.T + [x, 0, 0] + [0, y, 0])
-                facing.append(-R[:, 2])
+    post = trimesh.creation.cylinder(24 / np.cos(np.pi / 8), 120, sections=8)
+    post.apply_transform(_turn(np.pi / 2, 0) @ _turn(np.pi / 8, 2))
+    posts = [post.copy().apply_translation((x, 0, 0)) for x in (-65, 65)]
+    square = np.array([[-7.0, -7, -24], [7, -7, -24], [7, 7, -24], [-7, 7, -24]])
+    places = list(product((-65, 65), np.arange(8) * np.pi / 4, (-40, 0, 40)))
+    turns = [rotation(np.array([0, angle, 0])) for _, angle, _ in places]
+    corners = [square @ R.T + [x, y, 0] for R, (x, _, y) in zip(turns, places, strict=True)]
+    facing = [-R[:, 2] for R in turns]
     half = THICKNESS / 2
     mesh = trimesh.util.concatenate([_box((-35, -35, -half), (35, 35, half)), *posts])
     clouds, markers, rng = {}, {}, np.random.default_rng(0)
