@@ -54,7 +54,7 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
 from slviewer.pipeline.stored_records import SessionLike, load_record, match_names, opened_or_made
-from slviewer.records.calibration import ModelCalibration
+from slviewer.records.calibration import SECOND_CAMERA, ModelCalibration
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
@@ -68,7 +68,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
 
 SmoothingKind = Literal["spline", "polynomial"]
-_OF_PAIR = {"projector's": "second camera's", "projector": "second camera"}
+_OF_PAIR = {"projector": SECOND_CAMERA}
 LENS = "lens/camera"
 """The session's copy of the camera's calibration that a file stated."""
 

@@ -23,7 +23,13 @@ from slviewer.pipeline.stored_records import (
     read_record,
     save_record,
 )
-from slviewer.records.calibration import ModelCalibration, Reprojection, SplinedFit, StereoFit
+from slviewer.records.calibration import (
+    SECOND_CAMERA,
+    ModelCalibration,
+    Reprojection,
+    SplinedFit,
+    StereoFit,
+)
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
@@ -223,12 +229,13 @@ def load_residuals(store: Session) -> dict[str, np.ndarray]:
 def load_reprojection(store: Session, stereo: StereoModel, model: str) -> Reprojection:
     """Return the residuals of the target poses by the ``model`` in use where it has any, else by
     the ``stereo`` one, which it refines."""
+    record = load_record(store, ModelCalibration, "stereo")
+    other = SECOND_CAMERA if record.second_camera else "projector"
     fit = load_record(store, ModelCalibration, model).fit if model == "splined" else None
     if isinstance(fit, SplinedFit) and fit.reprojection is not None:
-        return fit.reprojection
-    of_stereo = load_record(store, ModelCalibration, "stereo").fit
-    pattern_px = of_stereo.pattern_px if isinstance(of_stereo, StereoFit) else {}
-    return msgspec.structs.replace(stereo.reprojection, pattern_px=pattern_px)
+        return msgspec.structs.replace(fit.reprojection, other=other)
+    pattern_px = record.fit.pattern_px if isinstance(record.fit, StereoFit) else {}
+    return msgspec.structs.replace(stereo.reprojection, pattern_px=pattern_px, other=other)
 
 
 def load_model(store: Session, name: str | None) -> Model:

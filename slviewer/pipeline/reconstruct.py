@@ -394,9 +394,13 @@ def capture_cloud(
     stereo = load_stereo(store)
     check_sizes(capture.name, capture.size, capture.other_size, stereo.rig)
     calibration = model if isinstance(model, SplinedModel) else stereo
-    check = check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
+    depths = stereo.depth_range_mm
+    try:
+        check = check_phases(capture.name, phases, calibration, depths, accept_rejected)
+    except InputError as refusal:
+        raise InputError(capture.name_devices(str(refusal))) from refusal
     for message in (*lens_warnings(store, capture), *check.warnings):
-        warn(message)
+        warn(capture.name_devices(message))
     cloud = scale_cloud(
         reconstruct_cloud(model, phases, axis=axis, extrapolates=extrapolates),
         scale_factor(store, model.name),
