@@ -51,7 +51,7 @@ TERMS = {
     "U (k = 2)": "expanded uncertainty: with about 95 % probability the true value is within ± U",
     "calibrated depths": "distances from the camera at which the target was captured; nearer and"
     " farther the calibration is extrapolated",
-    "stereo": "model of lenses and poses of camera and projector",
+    "stereo": "model of lenses and poses of both devices",
     "pixelwise": "model with a function of its own for each camera pixel",
     "splined": "stereo with smooth local corrections of both lenses",
     "reprojection": "where the calibration predicts the target's features, compared with where they"
