@@ -120,8 +120,8 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
     checks.append(BandCheck("projector turned", "filled", turned_since["filled"], 0, 0))
     title = f"planes and spheres of the Letter at scale {scale:g}; the projector turned by 1 mrad"
     note = "; ".join(
-        f"{name}: {each['filled']:.0f} points of {FILLED} filled, their error is"
-        f" {each['error / sigma']:.2f} times their sigma"
+        f"{name}: {each['filled']:.0f} points of {FILLED} filled"
+        + f", their error is {each['error / sigma']:.2f} times their sigma" * (each["filled"] > 0)
         for name, each in fills.items()
     )
     return prove_checks(checks, scale, rows, {"rigs": rows, "fills": fills}, [title], [note])
