@@ -53,13 +53,15 @@ class Coverage:
     """Number of poses that cover each cell of the image (3, 4), each third of the depths (3,), and
     each tilt (5,).
 
-    ``range_mm``: nearest and farthest recommended depth.
+    ``range_mm``: nearest and farthest recommended depth. ``second``: the cells (3, 4) of a second
+    camera's image, which the goal does not count; None without one.
     """
 
     cells: np.ndarray
     depths: np.ndarray
     tilts: np.ndarray
     range_mm: tuple[float, float]
+    second: np.ndarray | None = None
 
     @property
     def share(self) -> float:
@@ -124,6 +126,19 @@ def count_coverage(board: Board, lens: Lens, poses: Sequence[Floats]) -> Coverag
     depths = np.bincount(thirds, minlength=len(THIRDS))
     tilts = np.bincount(tilts, minlength=len(TILTS))
     return Coverage(covered.sum(axis=0), depths, tilts, depth_range(board, lens))
+
+
+def count_cells(poses: Sequence[Floats], size: tuple[int, int]) -> np.ndarray:
+    """Count the poses with features, at pixels (n, 2), in each cell (3, 4) of an image of ``size``
+    (width, height)."""
+    counts = np.zeros((ROWS, COLUMNS), int)
+    for pixels in poses:
+        place = ((pixels[:, ::-1] + 0.5) * (ROWS, COLUMNS) / size[::-1]).astype(int)
+        row, column = np.clip(place, 0, (ROWS - 1, COLUMNS - 1)).T
+        covered = np.zeros_like(counts)
+        covered[row, column] = 1
+        counts += covered
+    return counts
 
 
 def place_board(board: Board, lens: Lens, R: Floats, depths: Floats, pixels: Floats) -> Floats:

@@ -70,6 +70,8 @@ MAX_BLOCK_PX = 5
 """Largest side of a block; over more pixels, the phase of a tilted board is not linear."""
 MIN_FILL_SHARE = 0.5
 """Share of a block's pixels that must be bright."""
+LIGHT = "light_"
+"""Before the names of the arrays of an observation's ``light``."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +242,8 @@ class Observation:
     ``radius_mm``: of circles, whose pixels are the centroids of their images (see
     ``calibration.centres``); 0 where they are centres. ``marked``: whether the board's mark was
     detected, so that the numbering is unambiguous. ``samples``: unsmoothed phase at bright blocks;
-    None in older observations.
+    None in older observations. ``light``: of two cameras, where "projector" stands for the second
+    one, the same features as the projector itself lit them; None where it lit one axis.
     """
 
     name: str
@@ -256,6 +259,7 @@ class Observation:
     radius_mm: float = 0.0
     marked: bool = False
     samples: Samples | None = field(default=None, repr=False)
+    light: "Observation | None" = field(default=None, repr=False)
 
     @property
     def region(self) -> Mask:
@@ -299,6 +303,9 @@ class Observation:
             }
             if isinstance(surface, SplineSurface):
                 arrays[f"{axis}_spline"] = surface.coefficients
+        if self.light is not None:
+            own = self.light.to_arrays()
+            arrays |= {f"{LIGHT}{name}": values for name, values in own.items()}
         return arrays
 
     @classmethod
@@ -316,6 +323,9 @@ class Observation:
         samples = None
         if "samples_camera" in arrays:
             samples = Samples(*(arrays[f"samples_{name}"] for name in Samples.__annotations__))
+        of_light = {
+            key.removeprefix(LIGHT): each for key, each in arrays.items() if key.startswith(LIGHT)
+        }
         return cls(
             name,
             arrays["points"],
@@ -330,6 +340,7 @@ class Observation:
             float(arrays.get("radius_mm", 0.0)),
             bool(arrays.get("marked", False)),
             samples,
+            cls.from_arrays(name, of_light) if of_light else None,
         )
 
 

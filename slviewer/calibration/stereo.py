@@ -137,6 +137,7 @@ class StereoModel:
             projector_pixels
         )
 
+    @property
     def device_rays(self) -> tuple[Floats, Floats]:
         """Undistorted normalised coordinates (h, w, 2) of each pixel of both devices."""
         return self.rig.camera.rays(), self.rig.projector.rays()

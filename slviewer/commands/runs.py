@@ -340,7 +340,7 @@ def run_import(layout: str, import_captures: Function, arguments: Arguments) -> 
 def run_frames(import_captures: Function, arguments: Arguments) -> None:
     """Import folders that a TOML describes, or propose that TOML, to ``out`` or standard output.
     Raises InputError for doubts."""
-    from slviewer.session.importers.frames import guess_description
+    from slviewer.session.importers.guessed_frames import guess_description
 
     options = take_options(arguments, GuessOptions)
     guess, out = options.guess, options.out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
@@ -59,7 +60,7 @@ class PhaseMap:
     leaves, beside noise. ``sigma_scale``: factor by which neighbouring pixels scatter more than
     both predict, 1 where they do not (see `scatter`). ``sigma_known``: (h, w) float32 rad, the
     standard deviation of a phase that was not decoded from these maps (see
-    `reconstruction.camera_match`).
+    `reconstruction.camera_match`), whose ``light`` are the decoded ones, by axis.
     """
 
     axis: Axis
@@ -75,6 +76,7 @@ class PhaseMap:
     model_error_rad: float = 0.0
     sigma_scale: float = 1.0
     sigma_known: np.ndarray | None = None
+    light: Mapping[Axis, PhaseMap] | None = None
 
     def __post_init__(self) -> None:
         """Raise InputError unless all maps have the same shape (h, w)."""

@@ -346,11 +346,12 @@ class Shell(ControlGroup):
         if camera:
             K = (rig.camera if rig else nominal_lens(camera)).K
             self._devices.device("camera", K, camera, np.eye(4), CAMERA)
-        if projector and rig is not None:
+        if projector and rig is not None and calibration is not None:
             T_camera_projector = np.eye(4)  # the inverse of X_p = R X_c + t
             T_camera_projector[:3, :3], T_camera_projector[:3, 3] = rig.R.T, -rig.R.T @ rig.t
+            other = calibration.reprojection.other
             self._devices.device(
-                "projector", rig.projector.K, projector, T_camera_projector, PROJECTOR
+                other, rig.projector.K, rig.projector.size, T_camera_projector, PROJECTOR
             )
 
     # requests

@@ -17,7 +17,11 @@ from slviewer.calibration.diagnosis.rules import judge_evidence, judge_splined
 from slviewer.calibration.known_camera import UNSTATED_SIGMA, KnownCamera
 from slviewer.calibration.observe import Smoothing
 from slviewer.calibration.pixelwise import MIN_POSES, PixelwiseModel, calibrate_pixelwise
-from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
+from slviewer.calibration.splined.model import (
+    SplinedModel,
+    calibrate_projector,
+    calibrate_splined,
+)
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import (
     CalibrationRejected,
@@ -43,13 +47,14 @@ from slviewer.pipeline.models import (
     preferred_model,
     save_compiled,
     save_model,
+    save_projector,
     trash_models,
     warn_if_frame_changed,
 )
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
 from slviewer.pipeline.stored_records import SessionLike, load_record, match_names, opened_or_made
-from slviewer.records.calibration import ModelCalibration
+from slviewer.records.calibration import SECOND_CAMERA, ModelCalibration
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
@@ -63,7 +68,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
 
 SmoothingKind = Literal["spline", "polynomial"]
-_OF_PAIR = {"projector's": "second camera's", "projector": "second camera"}
+_OF_PAIR = {"projector": SECOND_CAMERA}
 LENS = "lens/camera"
 """The session's copy of the camera's calibration that a file stated."""
 
@@ -189,6 +194,7 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
         save_verdict(store, diagnosed.verdict, names)
     result = _fit_models(diagnosed, settings, part(job.progress, 0.66, 0.97), job.warn, excluded)
     result = replace(result, verdict=_name_devices(result.verdict, first))
+    projector = _fit_projector(result.splined, diagnosed, first, job.warn)
     job.progress(0.97, "saving")
     inputs = store.input_hashes(*result.stereo.poses, *([LENS] if camera else []))
     used = replace(settings, camera=LENS if camera else None)  # the session's own copy
@@ -206,11 +212,25 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
             record = msgspec.structs.replace(found.record, second_camera=first.second is not None)
             yield replace(found, record=record, settings=used)
             save_compiled(store, model)
+        if projector is not None:
+            save_projector(store, projector)
         save_verdict(store, result.verdict, names)
     if result.is_rejected:
         raise rejection_error(result.verdict, is_saved=True)
     warn_if_frame_changed(store, before, job.warn)
     job.progress(1.0, "calibrated")
+
+
+def _fit_projector(
+    pair: SplinedModel | None, diagnosed: DiagnosedCalibration, pose: Capture, warn: Warn
+) -> SplinedModel | None:
+    """Return the projector of two cameras in their frame of reference, from poses with patterns
+    along both axes; None, with a warning where it cannot be fitted, without."""
+    if pair is None or not any(o.light for o in diagnosed.observations):
+        return None
+    with _warn_of_failure("projector's", MODELS, warn):
+        return calibrate_projector(pair, diagnosed.observations, pose.sequence.projector)
+    return None
 
 
 def _name_devices(verdict: Verdict, pose: Capture) -> Verdict:

@@ -1,6 +1,6 @@
 """Results of the checks of a rig or of a capture."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from slviewer.records.plain import to_plain
@@ -51,6 +51,27 @@ class Preflight:
         """The worst of all checks; what is unknown does not make a good rig worse."""
         verdicts = {check.verdict for check in self.checks}
         return next((verdict for verdict in _WORST_FIRST if verdict in verdicts), "unknown")
+
+    def join(self, second: "Preflight") -> "Preflight":
+        """Return the checks of two cameras: of each the worse one, which says where it is the
+        ``second`` camera's. The longer wait is set, and the shorter exposure, if both are wrong."""
+        others = {check.name: check for check in second.checks}
+        joined = []
+        for check in self.checks:
+            other = others.get(check.name, check)
+            pair = Preflight((check, other), None, None, None, 0.0)
+            if other.verdict == pair.verdict != check.verdict:
+                check = replace(other, sentence=f"Second camera: {other.sentence}")
+            joined.append(check)
+        settle = self.settle_ms, second.settle_ms
+        exposure = self.exposure_ms, second.exposure_ms
+        return Preflight(
+            tuple(joined),
+            None if None in settle else max(filter(None, settle), default=0.0),
+            self.levels,
+            None if None in exposure else min(filter(None, exposure), default=None),
+            self.seconds + second.seconds,
+        )
 
     def check(self, name: CheckName) -> Check:
         """The check called `name`. Raises KeyError."""

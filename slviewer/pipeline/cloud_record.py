@@ -67,6 +67,7 @@ def cloud_record(
         misfit_px=None if cloud.misfit is None else float(cloud.misfit.excess_px.max()),
         masked=masked,
         depths=check_depths(store, cloud),
+        fill=cloud.fill,
         frame=frame_of(store, cloud.model),
         **describe_calibration(store, cloud.model, [settings.capture]),
     )

@@ -15,7 +15,7 @@ _DECISIONS = (
     "model", "use_anyway",
 )  # fmt: skip
 """What the new session remembers: what does not concern a part."""
-_KINDS = ("calibration", "compiled", "scale")
+_KINDS = ("calibration", "compiled", "projector", "scale")
 """Of results that are copied, beside those of the poses and the verdict."""
 
 

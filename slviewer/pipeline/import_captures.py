@@ -36,7 +36,7 @@ from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.capture import Capture, NewCapture, Role
 from slviewer.session.importers import opencv_calibration
 from slviewer.session.importers.filestorage import read_storage
-from slviewer.session.importers.frames import guess_description
+from slviewer.session.importers.guessed_frames import guess_description
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
     FolderLayout,
@@ -245,7 +245,7 @@ def find_captures(
         warn(assumption)
     if channel is None:
         return imports
-    recordings = [replace(recording, channel=channel) for recording in imports.recordings]
+    recordings = [recording.read_channel(channel) for recording in imports.recordings]
     return replace(imports, recordings=recordings)
 
 

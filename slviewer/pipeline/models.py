@@ -23,7 +23,13 @@ from slviewer.pipeline.stored_records import (
     read_record,
     save_record,
 )
-from slviewer.records.calibration import ModelCalibration, Reprojection, SplinedFit, StereoFit
+from slviewer.records.calibration import (
+    SECOND_CAMERA,
+    ModelCalibration,
+    Reprojection,
+    SplinedFit,
+    StereoFit,
+)
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
@@ -42,8 +48,10 @@ LENS_TOLERANCE = 1e-3
 COMPILED = "compiled/splined"
 COMPILED_VERSION = 1
 """Of what `SplinedModel.compile_depth` returns."""
-MAX_LOADED = 2
-_LOADED: dict[str, Model] = {}  # by the hash of the saved result
+PROJECTOR = "projector/splined"
+"""Of two cameras the projector, in the frame of their splined calibration."""
+MAX_LOADED = 3
+_LOADED: dict[str, PixelwiseModel | SplinedModel] = {}  # by the hash of the saved result
 _LOADED_LOCK = threading.Lock()
 _RESTORED: dict[str, type[PixelwiseModel | SplinedModel]] = {
     "pixelwise": PixelwiseModel,
@@ -221,12 +229,13 @@ def load_residuals(store: Session) -> dict[str, np.ndarray]:
 def load_reprojection(store: Session, stereo: StereoModel, model: str) -> Reprojection:
     """Return the residuals of the target poses by the ``model`` in use where it has any, else by
     the ``stereo`` one, which it refines."""
+    record = load_record(store, ModelCalibration, "stereo")
+    other = SECOND_CAMERA if record.second_camera else "projector"
     fit = load_record(store, ModelCalibration, model).fit if model == "splined" else None
     if isinstance(fit, SplinedFit) and fit.reprojection is not None:
-        return fit.reprojection
-    of_stereo = load_record(store, ModelCalibration, "stereo").fit
-    pattern_px = of_stereo.pattern_px if isinstance(of_stereo, StereoFit) else {}
-    return msgspec.structs.replace(stereo.reprojection, pattern_px=pattern_px)
+        return msgspec.structs.replace(fit.reprojection, other=other)
+    pattern_px = record.fit.pattern_px if isinstance(record.fit, StereoFit) else {}
+    return msgspec.structs.replace(stereo.reprojection, pattern_px=pattern_px, other=other)
 
 
 def load_model(store: Session, name: str | None) -> Model:
@@ -243,7 +252,13 @@ def load_model(store: Session, name: str | None) -> Model:
         )
     if name == "stereo":
         return load_stereo(store)
-    result = f"calibration/{name}"
+    return _load_cached(store, f"calibration/{name}", _RESTORED[name])
+
+
+def _load_cached(
+    store: Session, result: str, kind: type[PixelwiseModel | SplinedModel]
+) -> PixelwiseModel | SplinedModel:
+    """Return the model of this ``kind`` that a result holds, from memory where it is there."""
     content = store.input_hashes(result)[result]
     with _LOADED_LOCK:
         if content in _LOADED:
@@ -252,17 +267,36 @@ def load_model(store: Session, name: str | None) -> Model:
     with decoding(
         result,
         lambda fault: SessionError(
-            f"the {name} calibration in {store.folder} was saved by another version of slviewer, or"
+            f"{result} in {store.folder} was saved by another version of slviewer, or"
             f" {fault}: run `slviewer calibrate` again"
         ),
     ):
-        model: Model = _RESTORED[name].from_arrays(meta["model"], arrays)
-    if isinstance(model, SplinedModel):
+        model = kind.from_arrays(meta["model"], arrays)
+    if isinstance(model, SplinedModel) and result != PROJECTOR:
         _restore_or_compile(store, model, content)
     with _LOADED_LOCK:
         while len(_LOADED) >= MAX_LOADED:
             _LOADED.pop(next(iter(_LOADED)))
         return _LOADED.setdefault(content, model)
+
+
+def save_projector(store: Session, model: SplinedModel) -> None:
+    """Save the projector of two cameras beside the session's splined calibration."""
+    meta = {"model": model.to_dict(), "inputs": store.input_hashes("calibration/splined")}
+    store.save_result(PROJECTOR, meta, model.to_arrays())
+
+
+def load_projector(store: Session) -> SplinedModel | None:
+    """Load the projector of two cameras as the device beside the first one; None where the present
+    calibration has none."""
+    if store.state_of(PROJECTOR) == "absent":
+        return None
+    calibration = "calibration/splined"
+    inputs = store.load_result(PROJECTOR, only=())[0]["inputs"]
+    if inputs != store.input_hashes(calibration):
+        return None
+    model = _load_cached(store, PROJECTOR, SplinedModel)
+    return model if isinstance(model, SplinedModel) else None
 
 
 def _restore_or_compile(store: Session, model: SplinedModel, content: str) -> None:

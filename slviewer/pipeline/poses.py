@@ -2,7 +2,8 @@
 the session as `poses/<name>` and `evidence/<name>`."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
@@ -103,6 +104,10 @@ def read_pose(
             raise InputError(pose.fault)
         detection = detect(pose.board, pose.texture)
         observation = observe(name, pose.board, detection, pose.matched or phases, smoothing)
+        if pose.matched and len(phases) == 2:
+            with suppress(InputError):  # the cameras do without
+                light = observe(name, pose.board, detection, phases, smoothing)
+                observation = replace(observation, light=light)
         if observed is not None:
             observed(observation)
     except InputError as error:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import DetectionError, InputError, UsageError
 from slviewer.evaluation.fit import Comparison, fit_clouds
-from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.cloud_record import cloud_record, masked_share
@@ -26,6 +26,7 @@ from slviewer.pipeline.models import (
     lens_warnings,
     load_model,
     load_models,
+    load_projector,
     load_stereo,
     preferred_model,
     warn_if_stale,
@@ -36,6 +37,7 @@ from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restric
 from slviewer.pipeline.stored_records import is_up_to_date, load_record, numbered_names, placed_file
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud, Misfit, choose_pixels, keep_pixels
+from slviewer.reconstruction.projector_fill import fill_unseen
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud, triangulate_grid
 from slviewer.reconstruction.relative_phase import resolve_phase
 from slviewer.records.merge import Merge
@@ -381,7 +383,8 @@ def capture_cloud(
     extrapolates: bool = False,
 ) -> Cloud:
     """Reconstruct the organised cloud of a decoded capture, with the scale of its calibration
-    applied; ``extrapolates`` as in `reconstruct_cloud`.
+    applied; ``extrapolates`` as in `reconstruct_cloud`. What the second of two cameras does not see
+    is filled by the projector, where that was calibrated too.
 
     Raises InputError where capture and calibration do not belong together: by their sizes, or by
     how far the axes of the capture miss each other, which is a warning if ``accept_rejected``.
@@ -391,20 +394,34 @@ def capture_cloud(
     stereo = load_stereo(store)
     check_sizes(capture.name, capture.size, capture.other_size, stereo.rig)
     calibration = model if isinstance(model, SplinedModel) else stereo
-    check = check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
+    depths = stereo.depth_range_mm
+    try:
+        check = check_phases(capture.name, phases, calibration, depths, accept_rejected)
+    except InputError as refusal:
+        raise InputError(capture.name_devices(str(refusal))) from refusal
     for message in (*lens_warnings(store, capture), *check.warnings):
-        warn(message)
+        warn(capture.name_devices(message))
     cloud = scale_cloud(
         reconstruct_cloud(model, phases, axis=axis, extrapolates=extrapolates),
         scale_factor(store, model.name),
     )
-    if (misfit := check.misfit) is None:
+    if (misfit := check.misfit) is not None:
+        noise_px, known = phases[cloud.axis].sigma_px, cloud.sigma_edges
+        excess = cv2.resize(misfit.excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
+        edges = error if known is None else np.hypot(known, error)
+        cloud = replace(cloud, sigma_edges=edges, misfit=misfit)
+    phase = phases[cloud.axis]
+    if model.name != "splined" or phase.light is None or (beside := load_projector(store)) is None:
         return cloud
-    noise_px, known = phases[cloud.axis].sigma_px, cloud.sigma_edges
-    excess = cv2.resize(misfit.excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
-    edges = error if known is None else np.hypot(known, error)
-    return replace(cloud, sigma_edges=edges, misfit=misfit)
+    lit = scale_cloud(
+        reconstruct_cloud(beside, phase.light, extrapolates=extrapolates),
+        scale_factor(store, model.name),
+    )
+    cloud = fill_unseen(cloud, lit, phase.reason == Reason.UNSEEN)
+    if cloud.fill and not cloud.fill.is_used and (text := cloud.fill.text()):
+        warn(f"{capture.name}: {text}")
+    return cloud
 
 
 def absolute_phases(
@@ -503,7 +520,7 @@ def scan_cloud(
     meta = store.load_result(stored, only=())[0] if fresh else {}
     if meta and (capture.is_imported_cloud or model in (None, "", meta["model"])):
         names = set(meta["arrays"]) - {"phase", "modulation"}
-        arrays = store.load_result(stored, only=names)[1]
+        arrays: dict[str, Any] = store.load_result(stored, only=names)[1]
         for message in lens_warnings(store, capture):
             job.warn(message)
         misfit = Misfit.pop_from(arrays)

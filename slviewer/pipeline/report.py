@@ -435,8 +435,7 @@ def _describe_calibration(store: Session, name: str) -> list[str]:
         lines = [f"calibration {name}: from {len(meta['inputs'])} poses, {state}{mark}"]
         of = load_reprojection(store, load_stereo(store), name)
         if of.model == name:
-            errors = ", ".join(f"{device} {px:.3f} px" for device, px in of.rms_px.items())
-            lines.append(f"  reprojection RMS {errors}")
+            lines.append(f"  reprojection RMS {of.rms_text}")
         return lines
     lines = [f"calibration {name}: imported from {meta['source']}, {state}{mark}"]
     for device in ("camera", "projector"):

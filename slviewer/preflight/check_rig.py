@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from slviewer.devices.capture import can_burst
-from slviewer.devices.protocols import Rig, report_driver_faults
+from slviewer.devices.protocols import CameraSettings, Rig, report_driver_faults
 from slviewer.errors import DeviceError
 from slviewer.pipeline.capture import RigSettings, set_camera
 from slviewer.pipeline.check_results import Check, CheckName, Preflight
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.rig_choice import RigLike, SetUp, load_rig, set_up
 from slviewer.pipeline.stored_records import SessionLike, opened
 from slviewer.preflight.latency import measure_latency
@@ -62,14 +62,17 @@ def check_rig(
             choice = load_rig(rig, store)
     progress(0.0, "opening the devices")
     with set_up(choice, None).rig.opened() as devices:
-        with report_driver_faults(devices.camera):
-            before = devices.camera.settings()
+        before = list[CameraSettings]()
+        for camera in devices.cameras:
+            with report_driver_faults(camera):
+                before.append(camera.settings())
         set_camera(devices, choice, RigSettings(exposure_ms=exposure_ms, gain=gain, warn=warn))
         try:
             return preflight(devices, progress=progress)
         finally:  # a camera may keep what it was checked with
-            with suppress(DeviceError), report_driver_faults(devices.camera):
-                devices.camera.apply(before)
+            for camera, settings in zip(devices.cameras, before, strict=True):
+                with suppress(DeviceError), report_driver_faults(camera):
+                    camera.apply(settings)
 
 
 def check_recorded_rig(
@@ -107,15 +110,32 @@ def preflight(
     progress: Progress | None = None,
     clock: Clock = SYSTEM_CLOCK,
 ) -> Preflight:
-    """Check an open rig, on the thread that owns its devices; about 10 s.
+    """Check an open rig, on the thread that owns its devices; about 10 s for each of its cameras,
+    whose checks are joined as `Preflight.join` does.
 
     `say` receives one sentence for each check. `progress` may raise Cancelled. Raises DeviceError
     where a device does not answer. Patterns are loaded and light is shown; what was loaded and
     shown before is for the caller to restore.
     """
+    report = progress or ignore_progress
+    if rig.second is None:
+        return _check_camera(rig, say or ignore_warnings, report, clock)
+    alone = replace(rig, second=None, bursts=False)
+    first = _check_camera(alone, say or ignore_warnings, part(report, 0.0, 0.5), clock)
+    other = replace(alone, camera=rig.second, turntable=None)
+
+    def say_of_second(sentence: str) -> None:
+        """Report a check of the second camera."""
+        if say is not None:
+            say(f"Second camera: {sentence}")
+
+    return first.join(_check_camera(other, say_of_second, part(report, 0.5, 1.0), clock))
+
+
+def _check_camera(rig: Rig, say: Warn, report: Progress, clock: Clock) -> Preflight:
+    """Check an open rig with one camera, as `preflight`."""
     began, shown = clock.now(), 0
     checks: list[Check] = []
-    report = progress or ignore_progress
 
     def tick(doing: str) -> None:
         """Report progress by one more image."""
@@ -127,8 +147,7 @@ def preflight(
         """Store the checks, and report each with its remedy."""
         for check in results:
             checks.append(check)
-            if say is not None:
-                say(check.sentence if not check.remedy else f"{check.sentence} {check.remedy}")
+            say(check.sentence if not check.remedy else f"{check.sentence} {check.remedy}")
 
     bench = RigUnderTest(replace(rig, bursts=False), tick, clock)
     bench.measure_references()

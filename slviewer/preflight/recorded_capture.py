@@ -19,7 +19,7 @@ from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_fr
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
 from slviewer.pipeline.examination import examine_frames, name_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import check_repeats
 from slviewer.records.verdict import LIGHT_CAUSES, ORDER_CAUSES, Cause, Examination
@@ -36,7 +36,16 @@ image."""
 
 
 def preflight_capture(capture: Capture, progress: Progress = ignore_progress) -> Preflight:
-    """Check the rig of a capture from its frames, with the messages of `check_rig.preflight`."""
+    """Check the rig of a capture from its frames, with the messages of `check_rig.preflight`; of
+    two cameras as `Preflight.join`."""
+    if capture.second is None:
+        return _check_frames(capture, progress)
+    first = _check_frames(capture, part(progress, 0.0, 0.5))
+    return first.join(_check_frames(capture.second, part(progress, 0.5, 1.0)))
+
+
+def _check_frames(capture: Capture, progress: Progress) -> Preflight:
+    """Check the frames of one camera."""
     began = time.monotonic()
     progress(0.0, "reading frames")
     frames, sequence = capture.stack(), capture.sequence

@@ -52,6 +52,7 @@ class PairCalibration(Protocol):
     def pinholes(self) -> StereoRig:
         """Both lenses by their best pinhole and Brown models, and their arrangement."""
 
+    @property
     def device_rays(self) -> tuple[np.ndarray, np.ndarray]:
         """Undistorted normalised coordinates (h, w, 2) of each pixel of both cameras."""
 
@@ -78,7 +79,7 @@ def match_cameras(
 
     ``first``, ``second``: the absolute phases that each camera decoded. ``lines``: needed where the
     patterns have one axis. Sigma is that of both cameras' phases. Masked as `Reason.UNSEEN` where
-    the second camera sees no such point, or an edge.
+    the second camera sees no such point, or an edge. Their ``light`` is ``first``.
 
     Raises InputError for one axis without lines.
     """
@@ -100,7 +101,7 @@ def match_cameras(
             sigmas[k].append(np.full_like(rows, lines.sigmas[k]))
     found = _find(*(np.stack(maps, axis=-1, dtype=np.float64) for maps in (*numbers, *sigmas)))
     own = [phase for phase, _ in known]
-    return {axis: _as_phase(axis, own, found) for axis in axes}
+    return {axis: replace(_as_phase(axis, own, found), light=dict(first)) for axis in axes}
 
 
 def _as_phase(axis: Axis, own: Sequence[PhaseMap], found: np.ndarray) -> PhaseMap:
@@ -139,7 +140,7 @@ def epipolar_lines(calibration: PairCalibration) -> Lines:
         x, z = (rays @ each[:2] + each[2] for each in to_frame)
         return np.ascontiguousarray(focal * x / z)
 
-    first, second = calibration.device_rays()
+    first, second = calibration.device_rays
     apart: Axis = "x" if abs(rig.t[0]) >= abs(rig.t[1]) else "y"
     return Lines(rows(first, frame), rows(second, frame @ rig.R.T), (0.0, 0.0), (apart,))
 

@@ -10,6 +10,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rigid import Floats, Floats32, Mask
+from slviewer.records.reconstruction import ProjectorFill
 
 Points = np.ndarray
 """Of an organised cloud (h, w, 3), or some of its points (n, 3), mm; or directions there."""
@@ -67,7 +68,8 @@ class Cloud:
     (h, w) grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the
     camera's range (10, 12, 14 or 16 bits, whichever holds its brightest pixel). ``normals``: (h, w,
     3) float32 of imported points, which lie in rows without being neighbours, in the frame of their
-    file; their ``model`` is "", and ``sigma_z`` along these normals.
+    file; their ``model`` is "", and ``sigma_z`` along these normals. ``fill``: of two cameras, what
+    the projector measured where the second one does not see.
     """
 
     points: Points
@@ -80,6 +82,7 @@ class Cloud:
     misfit: Misfit | None = None
     normals: Points | None = None
     extrapolated: Mask | None = None
+    fill: ProjectorFill | None = None
 
     def __post_init__(self) -> None:
         for name in ("points", "sigma_z", "sigma_calibration", "sigma_edges", "normals"):

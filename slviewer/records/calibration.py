@@ -27,15 +27,34 @@ def is_pattern(shared_px: float, rms_px: float) -> bool:
     return shared_px > max(MIN_PATTERN_PX, MIN_PATTERN_SHARE * rms_px)
 
 
+SECOND_CAMERA = "second camera"
+
+
 class Reprojection(msgspec.Struct, frozen=True):
     """Residuals of a ``model`` on the target poses that it was made from, by "camera" and
     "projector": ``rms_px`` of all, ``pose_rms_px`` (camera, projector) of each, and ``pattern_px``,
-    the RMS of what neighbouring residuals share, which the model lacks; empty where not known."""
+    the RMS of what neighbouring residuals share, which the model lacks; empty where not known.
+    ``other``: what texts call the device beside the camera."""
 
     model: str
     rms_px: dict[str, float]
     pose_rms_px: dict[str, tuple[float, float]]
     pattern_px: dict[str, float] = {}
+    other: str = "projector"
+
+    @property
+    def devices(self) -> dict[str, str]:
+        """{device: its name in texts}."""
+        return {"camera": "camera", "projector": self.other}
+
+    @property
+    def rms_text(self) -> str:
+        """The RMS of all residuals of each device, "camera 0.041 px, projector 0.052 px"."""
+        return ", ".join(f"{self.devices[each]} {px:.3f} px" for each, px in self.rms_px.items())
+
+    def rename(self, table: Table) -> Table:
+        """Return a table of the calibration with the other device called by its name."""
+        return table.rename({"projector": self.other})
 
     @property
     def patterns(self) -> dict[str, float]:
@@ -52,7 +71,7 @@ class Reprojection(msgspec.Struct, frozen=True):
         if model != self.model or not self.patterns or "residuals" in verdict.causes:
             return verdict
         parts = " and ".join(
-            f"{px:.3f} of {self.rms_px[device]:.3f} px in the {device}"
+            f"{px:.3f} of {self.rms_px[device]:.3f} px in the {self.devices[device]}"
             for device, px in self.patterns.items()
         )
         remedy = (
@@ -368,6 +387,8 @@ class ModelCalibration(Record, frozen=True, kw_only=True):
             else [f"{line.strip()}." for line in self.verdict.text().splitlines()]
         )
         pair = ["Two cameras: the second one takes the projector's place."] * self.second_camera
+        if self.second_camera:
+            of_fit = of_fit.rename({"projector": SECOND_CAMERA})
         return replace(of_fit, notes=[*pair, *of_fit.notes, *verdict])
 
 

@@ -54,6 +54,42 @@ class DepthCheck(msgspec.Struct, frozen=True):
         )
 
 
+class ProjectorFill(msgspec.Struct, frozen=True):
+    """The ``points`` that the second of two cameras does not see, and the projector can measure:
+    whether they were filled by it (``is_used``), and by how much, mm RMS, the projector differs
+    from the cameras where both measure, and is predicted to; None where too little could be
+    compared."""
+
+    points: Count
+    is_used: bool
+    different_mm: float | None = None
+    predicted_mm: float | None = None
+
+    def text(self) -> str:
+        """Describe what was filled, or why nothing was; empty where there is nothing to fill."""
+        if not self.points:
+            return ""
+        if self.different_mm is None:
+            return (
+                f"{self.points:,} points that the second camera does not see are left unmeasured:"
+                " too few others are measured by the projector and by the cameras to compare them"
+            )
+        differs = (
+            f"where both measure, the projector is {self.different_mm:.3f} mm beside the cameras,"
+            f" and {self.predicted_mm:.3f} mm are predicted"
+        )
+        if self.is_used:
+            return (
+                f"{self.points:,} points that the second camera does not see were measured by the"
+                f" projector; {differs}"
+            )
+        return (
+            f"{self.points:,} points that the second camera does not see are left unmeasured:"
+            f" {differs}. It moved, or its focus changed, since the calibration: calibrate again to"
+            " measure them too"
+        )
+
+
 class ImportedPoints(msgspec.Struct, frozen=True):
     """Where an imported cloud is from: name, hash and unit of its file, what the normals and the
     standard deviation of its points rest on, in words, and notes on what was dropped or added."""
@@ -84,6 +120,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     correction of scale, in words; ``frame``: the one that the points are in, in words.
     ``depths``: the share of the points outside the calibrated depths, and what their sigma is
     worth; None where no such depths are known.
+    ``fill``: of two cameras, what the projector measured where the second one does not see.
     ``imported``: of points from a file, in rows that mean nothing; their arrays are ``points``,
     ``normals`` (h, w, 3), ``sigma_z`` along these, and ``texture`` where they have colours.
     """
@@ -104,6 +141,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     scale: str = ""
     frame: str = ""
     depths: DepthCheck | None = None
+    fill: ProjectorFill | None = None
     imported: ImportedPoints | None = None
 
     @classmethod
@@ -155,6 +193,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
                 f" what they look through: their sigma is {self.extrapolated_mm:.3f} mm in the"
                 " median. Merges, measurements, meshes and exported clouds are without them"
             )
+        if self.fill and (text := self.fill.text()):
+            yield text
         if (i := self.imported) is not None:
             yield "; ".join((f"from {i.file} in {i.unit}", i.normals, i.sigma, *i.notes))
 

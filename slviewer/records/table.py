@@ -157,6 +157,24 @@ class Table:
         """Return the values of a row."""
         return [cell.value if isinstance(cell, Cell) else cell for cell in row]
 
+    def rename(self, words: Mapping[str, str]) -> "Table":
+        """Return the table with words replaced in its headings, texts and notes."""
+
+        def renamed(value: Any) -> Any:
+            """Return a text with the words replaced; other values as they are."""
+            if isinstance(value, Cell):
+                return replace(value, value=renamed(value.value))
+            for word, other in words.items() if isinstance(value, str) else ():
+                value = value.replace(word, other)
+            return value
+
+        return replace(
+            self,
+            columns=[replace(each, title=renamed(each.title)) for each in self.columns],
+            rows=[[renamed(each) for each in row] for row in self.rows],
+            notes=[renamed(each) for each in self.notes],
+        )
+
     def select(self, keep: Sequence[Column]) -> "Table":
         """Return the table with some of its columns alone."""
         chosen = [index for index, column in enumerate(self.columns) if column in keep]

@@ -27,7 +27,7 @@ CAMERA, PROJECTOR = "#3c6e9e", "#c98a1b"
 
 
 def pose_bars(of: Reprojection, *, width: int = FULL) -> Figure:
-    """Reprojection RMS of each pose by a model, camera and projector side by side."""
+    """Reprojection RMS of each pose by a model, both devices side by side."""
     names = list(of.pose_rms_px)
     values = np.array([of.pose_rms_px[name] for name in names], float)
     narrow = width <= HALF
@@ -36,12 +36,12 @@ def pose_bars(of: Reprojection, *, width: int = FULL) -> Figure:
     style_axes(axes, "", "", f"reprojection RMS, {of.model}, px")
     axes.grid(False, axis="x")
     at = np.arange(len(names))
-    for i, (device, colour) in enumerate((("camera", CAMERA), ("projector", PROJECTOR))):
+    for i, ((device, name), colour) in enumerate(
+        zip(of.devices.items(), (CAMERA, PROJECTOR), strict=True)
+    ):
         rms = of.rms_px.get(device, np.nan)
         label = (
-            f"{device}, {'all' if narrow else 'all poses'} {rms:.3f} px"
-            if np.isfinite(rms)
-            else device
+            f"{name}, {'all' if narrow else 'all poses'} {rms:.3f} px" if np.isfinite(rms) else name
         )
         axes.bar(at + 0.4 * i - 0.2, values[:, i], 0.38, color=colour, label=label)
         if np.isfinite(rms):
@@ -55,7 +55,7 @@ def pose_bars(of: Reprojection, *, width: int = FULL) -> Figure:
         drawing,
         f"Reprojection error of each target pose by the {of.model} model. Dashed: the RMS over all"
         f" poses. The worst pose is {worst}.",
-        f"Bars of the reprojection error of {len(names)} poses, camera and projector; worst"
+        f"Bars of the reprojection error of {len(names)} poses, camera and {of.other}; worst"
         f" {worst}",
     )
 

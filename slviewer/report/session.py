@@ -51,12 +51,22 @@ TERMS = {
     "U (k = 2)": "expanded uncertainty: with about 95 % probability the true value is within ± U",
     "calibrated depths": "distances from the camera at which the target was captured; nearer and"
     " farther the calibration is extrapolated",
-    "stereo": "model of lenses and poses of camera and projector",
+    "stereo": "model of lenses and poses of both devices",
     "pixelwise": "model with a function of its own for each camera pixel",
     "splined": "stereo with smooth local corrections of both lenses",
     "reprojection": "where the calibration predicts the target's features, compared with where they"
     " were seen",
 }
+_MERGED = " Scans from several sides are registered onto each other and merged into one surface."
+_METHODS = {
+    False: "A projector casts stripe patterns on the object, and a camera records them. Which"
+    " stripe each camera pixel sees gives, with the calibration of both, the position of a point."
+    + _MERGED,
+    True: "A projector casts stripe patterns on the object, and two cameras record them. Pixels of"
+    " both that see the same stripes give, with the calibration of both, the position of a point."
+    + _MERGED,
+}
+"""How was measured, whether two cameras did."""
 DEVICES = ("camera", "projector")
 WORST = 2.0
 """A pose whose reprojection error exceeds the RMS over the poses this many times is marked."""
@@ -239,12 +249,7 @@ def session_sections(data: SessionData) -> list[Section]:
     if data.calibration is not None:
         annex += [
             _reprojection_section(data.calibration),
-            Section(
-                "Parameters",
-                "Lenses (pinhole and Brown distortion) of camera and projector, and where the"
-                " projector is in the camera's frame.",
-                [lens_table(data.calibration.stereo), rig_table(data.calibration.stereo)],
-            ),
+            _parameters_section(data.calibration),
         ]
     if data.pixel_fits:
         text = (
@@ -259,13 +264,20 @@ def session_sections(data: SessionData) -> list[Section]:
     return [*_notice_section(data), *results, *(replace(each, is_annex=True) for each in annex)]
 
 
+def _parameters_section(calibration: CalibrationFigures) -> Section:
+    """The section with the parameters of lenses and rig."""
+    stereo, of = calibration.stereo, calibration.reprojection
+    text = (
+        f"Lenses (pinhole and Brown distortion) of camera and {of.other}, and where the {of.other}"
+        " is in the camera's frame."
+    )
+    tables = [of.rename(each) for each in (lens_table(stereo), rig_table(stereo))]
+    return Section("Parameters", text, tables)
+
+
 def _method_section(data: SessionData) -> Section:
     """The section about how was measured, in what environment, and what terms mean."""
-    text = [
-        "A projector casts stripe patterns on the object, and a camera records them. Which stripe"
-        " each camera pixel sees gives, with the calibration of both, the position of a point."
-        " Scans from several sides are registered onto each other and merged into one surface."
-    ]
+    text = [_METHODS[any(each.capture.is_of_pair for each in data.captures)]]
     if data.model:
         used = f"Measured with the calibration model {data.model}"
         if data.model != data.recommended:
@@ -357,22 +369,23 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
         worst = max(residuals, key=lambda name: max(of.pose_rms_px.get(name, (0.0, 0.0))))
         items += [
             residual_arrows(
-                f"{device}, {of.model}, {worst} (the worst pose)", *residuals[worst][device], size
+                f"{of.devices[device]}, {of.model}, {worst} (the worst pose)",
+                *residuals[worst][device],
+                size,
             )
             for device, size in sizes.items()
         ]
         items += [
-            coverage(device, size, [each[device][0] for each in residuals.values()])
+            coverage(of.devices[device], size, [each[device][0] for each in residuals.values()])
             for device, size in sizes.items()
         ]
     if of.pose_rms_px:
-        items.append(_pose_table(of))
+        items.append(of.rename(_pose_table(of)))
     text = ["This calibration was made elsewhere, without a reprojection error."]
     if of.rms_px:
-        errors = ", ".join(f"{device} {value:.3f}" for device, value in of.rms_px.items())
         text = [
-            f"How far the target lies from where the {of.model} model predicts it, RMS in px:"
-            f" {errors}. Target: {stereo.board}."
+            f"How far the target lies from where the {of.model} model predicts it, RMS:"
+            f" {of.rms_text}. Target: {stereo.board}."
         ]
     if excluded := stereo.features_excluded:
         text.append(f"Excluded: {format_count(excluded, 'feature')} beyond 6 robust sigma.")

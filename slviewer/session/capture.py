@@ -14,6 +14,7 @@ from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
 from slviewer.fringe.layout import lowest_white, sample_phase_steps
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.records.calibration import SECOND_CAMERA
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.reading import MOST_REMEMBERED, decoding, identify, read_json
@@ -141,7 +142,7 @@ class Capture:
     @cached_property
     def second(self) -> "Capture | None":
         """What the second camera saw of the same patterns; None of a rig with one."""
-        if not self.meta.get(SECOND):
+        if not self.is_of_pair:
             return None
         second = read_capture(self.folder / SECOND)
         if second.hash != self.meta[SECOND]:
@@ -150,6 +151,16 @@ class Capture:
                 " it: restore the folder from a copy, or import or record the capture again"
             )
         return replace(second, name=f"{self.name}, second camera")
+
+    @property
+    def is_of_pair(self) -> bool:
+        """Whether two cameras took it."""
+        return bool(self.meta.get(SECOND))
+
+    def name_devices(self, text: str) -> str:
+        """Return a text on the calibration, in which a second camera has the projector's place,
+        with its name there."""
+        return text.replace("projector", SECOND_CAMERA) if self.is_of_pair else text
 
     @property
     def other_size(self) -> tuple[int, int] | None:

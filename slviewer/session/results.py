@@ -99,6 +99,12 @@ class _Compiled(ResultMeta, total=False):
     compiled: dict[str, Any]
 
 
+class _Projector(ResultMeta, total=False):
+    """`projector/splined`."""
+
+    model: dict[str, Any]
+
+
 class _Pose(ResultMeta, total=False):
     """`poses/*`."""
 
@@ -157,6 +163,7 @@ _TYPES: dict[str, Any] = {
     "calibration/stereo": _Stereo,
     "verdict": _Verdict,
     "compiled/splined": _Compiled,
+    "projector": _Projector,
     "poses": _Pose,
     "evidence": _Evidence,
     "trust": _Examination,

@@ -1,5 +1,6 @@
 """Whether two cameras measure at their noise floor, whatever the projector between them does."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -9,14 +10,19 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.observe import Observation, observe
+from slviewer.calibration.splined.model import SplinedModel, calibrate_projector
 from slviewer.fringe.decode import texture
-from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.shapes import fit_plane
+from slviewer.geometry.vectors import rms
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.camera_match import epipolar_lines, match_cameras
+from slviewer.reconstruction.projector_fill import fill_unseen
+from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.simulation.plans import letter_plan, rotation
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
@@ -43,6 +49,12 @@ SPACING_MM = 0.02
 """At half the resolution and above; below, fewer and coarser pixels determine a calibration."""
 MUST_SHIFT_MM = 0.1
 """What the turn does to the spacings of one camera, at least: else nothing turned."""
+FILLED = "plane_01"
+"""The nearest plane, of which the second camera sees the least."""
+MUST_FILL = 100_000
+"""Points of that plane, at least, at the full resolution."""
+HONEST = 0.7, 1.3
+"""RMS of the errors of filled points over their sigma."""
 Scan = Callable[[SimulatedRig, Scene, int], PhaseMap]
 
 
@@ -98,8 +110,37 @@ def prove_cameras(scale: float, seed: int, progress: Progress) -> Proof:
             checks.append(BandCheck(name, "a spacing's error, mm", spacing, MUST_SHIFT_MM, 100))
         elif "two" in name:
             checks.append(BandCheck(name, "a spacing's error, mm", spacing, 0, most))
+    projector = calibrate_projector(own[1], own[2], rig.projector.size)
+    fills = dict[str, dict[str, float]]()
+    for name, actual in (("two cameras", rig), ("two cameras, projector turned", turned)):
+        phase = scan_pair(actual, plan[FILLED], [*plan].index(FILLED))
+        fills[name] = measure_fill(own[1], projector, phase)
+    as_it_was, turned_since = fills.values()
+    for what, band in (("filled", (MUST_FILL * scale**2, 1e9)), ("error / sigma", HONEST)):
+        checks.append(BandCheck("two cameras", what, as_it_was[what], *band))
+    checks.append(BandCheck("projector turned", "filled", turned_since["filled"], 0, 0))
     title = f"planes and spheres of the Letter at scale {scale:g}; the projector turned by 1 mrad"
-    return prove_checks(checks, scale, rows, {"rigs": rows}, [title])
+    note = "; ".join(
+        f"{name}: {each['filled']:.0f} points of {FILLED} filled"
+        + f", their error is {each['error / sigma']:.2f} times their sigma" * (each["filled"] > 0)
+        for name, each in fills.items()
+    )
+    return prove_checks(checks, scale, rows, {"rigs": rows, "fills": fills}, [title], [note])
+
+
+def measure_fill(pair: SplinedModel, projector: SplinedModel, phase: PhaseMap) -> dict[str, float]:
+    """Return how many points of a plane the projector fills that the second camera does not see,
+    and the RMS of their distances from the plane through the others, over their sigma; NaN without
+    any."""
+    assert phase.light is not None
+    cloud = reconstruct_cloud(pair, {phase.axis: phase})
+    lit = reconstruct_cloud(projector, phase.light)
+    whole = fill_unseen(cloud, lit, phase.reason == Reason.UNSEEN)
+    filled = whole.mask & ~cloud.mask
+    plane = fit_plane(cloud.measured)
+    along_z = (whole.points[filled] @ plane.normal - plane.offset) / plane.normal[2]
+    error = rms(along_z / whole.sigma[filled]) if filled.any() else math.nan
+    return {"filled": float(np.count_nonzero(filled)), "error / sigma": error}
 
 
 def scan_both(
@@ -118,5 +159,7 @@ def scan_both(
 def observe_pair(rig: SimulatedRig, scene: Scene, name: str, number: int) -> Observation:
     """The observation of a rendered target pose by both cameras, whose noise ``number`` seeds."""
     sequence, board = p18(rig.projector.size), Board.parse(TARGET)
-    frames, phases = scan_both(rig, scene, sequence, number)
-    return observe(name, board, detect(board, texture(sequence, frames)), match_cameras(*phases))
+    frames, (first, second) = scan_both(rig, scene, sequence, number)
+    detection = detect(board, texture(sequence, frames))
+    light = observe(name, board, detection, first)
+    return replace(observe(name, board, detection, match_cameras(first, second)), light=light)

@@ -3,15 +3,17 @@ did not change are not read again (`session.reading.identify`); features of pose
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from slviewer.calibration.next_pose import outline_px
+from slviewer.calibration.next_pose import count_cells, outline_px
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
 from slviewer.errors import DamagedError, SessionError
 from slviewer.fringe.presets import PRESETS
+from slviewer.geometry.vectors import finite_rows
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
@@ -202,6 +204,8 @@ class SessionReader:
         refused = sum(state == "refused" for _, state, _, _ in judged)
         given = self._plan_input(target, calibration, rig, focal_px, features, refused)
         plan, is_final = self._planner.look_up(given) if given else (None, True)
+        if any(pose.is_of_pair for pose in captures):
+            plan = _cover_second(plan, given)
         poses = plan.poses if plan else {}
         used_px = calibration.reprojection.pose_rms_px if calibration else {}
         views = tuple(
@@ -390,6 +394,15 @@ def _make_features(
     return PoseFeatures(
         points, camera, projector, float(np.median(known)) if known.size else np.nan
     )
+
+
+def _cover_second(plan: PosePlan | None, given: PlanInput | None) -> PosePlan | None:
+    """Return a plan with what the poses cover of a second camera's image."""
+    if plan is None or given is None:
+        return plan
+    seen = [each.projector[finite_rows(each.projector)] for each in given.features.values()]
+    cells = count_cells(seen, given.projector)
+    return replace(plan, coverage=replace(plan.coverage, second=cells))
 
 
 def _list_deleted(session: Session, role: Role) -> tuple[str, ...]:

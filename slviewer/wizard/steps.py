@@ -163,7 +163,8 @@ def _describe_next_pose(now: Snapshot) -> str:
     """Return where to hold the board next."""
     session, number = now.content, now.content.good_poses + 1
     if now.session is None:
-        return "Hold the board in view of camera and projector."
+        cameras = "both cameras" if now.rig.second else "camera"
+        return f"Hold the board in view of {cameras} and projector."
     if session.pending_plan:
         action = "Computing the best next pose; or hold the board in any new place, and capture"
     elif session.suggestion:
@@ -204,12 +205,12 @@ def _describe_calibration(calibration: CalibrationView) -> str:
     """Return the number of poses and the reprojection RMS, and what follows."""
     if calibration.refused:
         return "This calibration was rejected: correct what is listed below, and calibrate again."
-    if not (rms := calibration.reprojection.rms_px):
+    if not calibration.reprojection.rms_px:
         return "This calibration was imported: verify it next."
-    errors = ", ".join(f"{device} {px:.3f} px" for device, px in rms.items())
     return (
         f"Calibrated from {len(calibration.stereo.poses)} poses. Reprojection RMS of"
-        f" {calibration.label}: {errors}. Check outlying poses, then verify."
+        f" {calibration.label}: {calibration.reprojection.rms_text}. Check outlying poses, then"
+        " verify."
     )
 
 

@@ -8,6 +8,7 @@ from facts import missing_facts, raises
 from slviewer.calibration.next_pose import (
     TILTS,
     approximate_pose,
+    count_cells,
     count_coverage,
     depth_range,
     estimated_lens,
@@ -113,3 +114,12 @@ def test_refused_suggestions_are_passed_over_and_large_boards_refused():
     assert not np.allclose(first, second)
     with raises(InputError, BOARD):
         suggest(BOARD, LENS, [], illuminated=lambda points: np.zeros(len(points), bool))
+
+
+def test_cells_of_an_image_are_counted_by_pose():
+    corner, whole = np.array([[0.0, 0.0], [399.4, 299.4]]), np.mgrid[:400:20, :300:20]
+    counts = count_cells([corner, whole.reshape(2, -1).T.astype(float)], (400, 300))
+    expected = np.ones((3, 4), int)
+    expected[0, 0] = expected[2, 3] = 2
+    np.testing.assert_array_equal(counts, expected)
+    assert not count_cells([], (400, 300)).any()

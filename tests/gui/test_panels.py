@@ -34,16 +34,19 @@ from slviewer.gui.app import App
 from slviewer.gui.colouring import paint_points, scan_values, uncertainty
 from slviewer.gui.panel import Painter, display_name
 from slviewer.gui.steps.calibrate import named_poses, verdict_html
+from slviewer.gui.steps.rig import list_presets
 from slviewer.gui.steps.scan import point_html, sort_scans
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html
 from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.calibrate import save_verdict
 from slviewer.pipeline.stored_records import Stored
+from slviewer.records.calibration import SECOND_CAMERA, Reprojection
 from slviewer.records.measurement import Measurement
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.plain import to_plain
 from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.table import Cell, Table
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Shape, Verification
 from slviewer.server.secure import Serving
@@ -571,3 +574,22 @@ def test_the_title_page_of_the_report_is_typed_once(
         "Vase &lt;b&gt;" in (operator.snapshot().content.folder / "exports/report.html").read_text()
     )
     assert errors == []
+
+
+def test_all_rigs_are_offered_but_those_that_the_list_has_already() -> None:
+    assert {"two-cameras", "turntable", "simulated-lightcrafter4500", "webcam"} <= {
+        *list_presets(None)
+    }
+    assert "simulated" not in list_presets(None)
+
+
+def test_residuals_name_the_second_camera() -> None:
+    rms_px = {"camera": 0.04, "projector": 0.05}
+    of = Reprojection("stereo", rms_px, {"pose": (0.04, 0.05)}, rms_px, SECOND_CAMERA)
+    assert of.rms_text == "camera 0.040 px, second camera 0.050 px"
+    assert "second camera" in of.judge(Verdict(()), "stereo").text()
+    table = of.rename(
+        Table.of([{"projector": 1.0, "camera": Cell("projector x")}], "", ["projector"])
+    )
+    assert [column.title for column in table.columns] == ["second camera", "camera"]
+    assert table.values(table.rows[0])[1] == "second camera x" and table.notes == ["second camera"]

@@ -1,5 +1,6 @@
 """Two cameras from the terminal: simulated, calibrated, scanned and merged; and a recorded pair."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from slviewer.devices.capture import capture_frames, capture_with_texture
 from slviewer.errors import InputError
 from slviewer.fringe.presets import gray, p18
 from slviewer.fringe.sequence import one_axis
+from slviewer.geometry.shapes import fit_plane
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.capture_phases import decode_capture, match_second
 from slviewer.pipeline.models import load_calibration, load_pair
@@ -20,10 +22,11 @@ from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.camera_match import epipolar_lines
 from slviewer.records.calibration import ModelCalibration
+from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.verification import Verification
 from slviewer.session.capture import NewCapture, Role
 from slviewer.session.store import Session
-from slviewer.simulation.plans import letter_plan, spheres
+from slviewer.simulation.plans import letter_plan, rotation, spheres
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.second_camera import second_camera
@@ -72,8 +75,46 @@ def test_two_cameras_are_calibrated_scan_and_merge(tmp_path: Path) -> None:
             assert 0.85 < ratio < 1.25
     names = [*spheres()]
     assert main(["verify", session, *names, "--shape", "sphere"]) == 0
+    check_what_the_projector_fills(session)
     scans = ["object_r1", "object_r2", "object_r3"]
     assert main(["merge", session, *scans, "--reference", "object_r2"]) == 0
+
+
+def check_what_the_projector_fills(session: str) -> None:
+    """Of a near plane, much of which the second camera does not see; and nothing after a turn."""
+    rig = letter(0.25)
+    turn = rotation(np.array([0.0, 0.001, 0.0]))
+    turned = replace(rig, R=turn @ rig.R, t=turn @ rig.t)
+    scene, sequence = letter_plan(rig, poses=10)["plane_01"], one_axis(p18(rig.projector.size), "x")
+    frames = Renderer(turned, scene).capture(sequence, 1)
+    seen = second_camera(turned).capture(scene, sequence, 1)
+    after = NewCapture("turned", sequence, frames, second=NewCapture("turned", sequence, seen))
+    with Session.open(session, write=True) as store:
+        store.save_captures([after], "scan")
+    for name in ("plane_01", "turned"):
+        assert main(["reconstruct", session, name]) == 0
+    with Session.open(session) as store:
+        (found, turned_since) = (
+            load_record(store, Reconstruction, n) for n in ("plane_01", "turned")
+        )
+        arrays, after_turn = (store.load_result(f"clouds/{n}")[1] for n in ("plane_01", "turned"))
+    unseen, unseen_then = (
+        np.isnan(each["phase"]) & np.isfinite(each["points"]).all(axis=-1)
+        for each in (arrays, after_turn)
+    )
+    assert not unseen_then.any()
+    assert found.fill is not None and found.fill.is_used
+    known = ~arrays["extrapolated"] if "extrapolated" in arrays else True
+    filled = unseen & known
+    assert 5_000 < np.count_nonzero(filled) <= found.fill.points
+    plane = fit_plane(arrays["points"][~np.isnan(arrays["phase"]) & known])
+    off = (arrays["points"][filled] @ plane.normal - plane.offset) / plane.normal[2]
+    parts = (arrays[f"sigma_{part}"][filled] for part in ("z", "calibration", "edges"))
+    sigma = np.sqrt(sum(part**2 for part in parts))
+    assert 0.7 < np.sqrt(np.mean((off / sigma) ** 2)) < 1.3
+    assert turned_since.fill is not None and not turned_since.fill.is_used
+    assert turned_since.fill.different_mm == pytest.approx(1.3, abs=0.3)
+    assert turned_since.points == pytest.approx(found.points - np.count_nonzero(filled), rel=0.01)
 
 
 @pytest.mark.slow

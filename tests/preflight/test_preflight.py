@@ -280,3 +280,18 @@ def test_a_camera_of_twelve_bits_that_says_nothing_of_its_exposure(looked):
     assert found.check("exposure").figures["bright_share_of_full_scale"] == pytest.approx(
         0.83, abs=0.03
     )
+
+
+def test_a_second_camera_is_checked_too(looked, lying, time, compiled):
+    pair = simulated_rig(world(), cameras=2)
+    assert pair.second is not None
+    found = looked(pair)
+    assert found.verdict == "good"
+    alone = Rig("second", pair.second, pair.projector)
+    late, _ = imperfect(alone, Imperfections(lag=1), time.clock)
+    said = list[str]()
+    found = looked(replace(pair, second=late.camera, projector=late.projector), say=said.append)
+    assert wrong_with(found) == {"latency", "order"}
+    assert found.check("order").figures["lag"] == 1
+    assert all("Second camera" in found.check(name).sentence for name in ("latency", "order"))
+    assert sum("Second camera" in each for each in said) == len(said) / 2

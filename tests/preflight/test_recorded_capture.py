@@ -17,6 +17,7 @@ from slviewer.fringe.presets import complementary, gray, p18
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.check_results import Preflight
 from slviewer.preflight.check_rig import check_recorded_rig
+from slviewer.session.capture import NewCapture
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
@@ -172,3 +173,12 @@ def test_the_command_writes_json_and_ends_with_1_for_a_bad_capture(
         main(["preflight", "--capture", str(tmp_path / "session"), "good", "--rig", "simulated"])
         == 2
     )
+
+
+def test_the_frames_of_a_second_camera_are_checked_too(tmp_path: Path) -> None:
+    sequence, stack = frames_of(p18)
+    late = NewCapture("part", sequence, np.roll(stack, 1, axis=0))
+    with Session.create(tmp_path / "session") as store:
+        store.save_capture("part", "scan", sequence, stack, second=late)
+    order = check_recorded_rig(tmp_path / "session", "part").check("order")
+    assert order.verdict == "bad" and "Second camera" in order.sentence

@@ -58,7 +58,7 @@ def true_calibration():
     ]
     rays = RIG.camera.rays(), SECOND.rig.camera.rays()
     pinholes = StereoRig(*lenses, SECOND.R, SECOND.t)
-    return SimpleNamespace(pinholes=pinholes, device_rays=lambda: rays)
+    return SimpleNamespace(pinholes=pinholes, device_rays=rays)
 
 
 def check_errors(matched, true, k):

@@ -86,6 +86,49 @@ def test_names_say_which_camera_files_are_of(tmp_path, noise, first, second, nam
     assert any("two cameras" in each for each in imports.warnings)
 
 
+def test_a_description_names_both_cameras(tmp_path, noise):
+    entry = '[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 4\nperiod_px = 16.0\n'
+    left, right = (
+        f'{entry}camera = "{camera}"\nfiles = "{files}"\n'
+        for camera, files in (("left", "A*.png"), ("right", "B*.png"))
+    )
+    described = tmp_path / "sequence.toml"
+    described.write_text(f'projector = "96x64"\n{right}{left}')
+    for seed, start in enumerate("AB"):
+        for k, frame in enumerate(noise(seed)):
+            cv2.imwrite(str(tmp_path / f"{start}{k}.png"), frame)
+    cv2.imwrite(str(tmp_path / "other.png"), noise(0)[0])
+    imports = find_captures(tmp_path, sequence=described)
+    (capture,) = imports
+    np.testing.assert_array_equal(capture.frames, noise(0))
+    np.testing.assert_array_equal(capture.second.frames, noise(1))
+    (warning,) = imports.warnings
+    assert "other.png" in warning and "B0.png" not in warning
+    (tmp_path / "B3.png").unlink()
+    with raises(InputError, "B*.png", "3", "4"):
+        find_captures(tmp_path, sequence=described)
+    described.write_text(f'projector = "96x64"\n{left}{entry}files = "B*.png"\n')
+    with raises(InputError, "camera", "[[frames]] 2"):
+        find_captures(tmp_path, sequence=described)
+    described.write_text(f'projector = "96x64"\n{left}{right.replace("steps = 4", "steps = 3")}')
+    with raises(InputError, "left", "right"):
+        find_captures(tmp_path, sequence=described)
+
+
+def test_files_that_neither_camera_took_are_named(tmp_path, noise):
+    (tmp_path / "sequence.toml").write_text(
+        'projector = "96x64"\n[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 4\n'
+        'period_px = 16.0\nfiles = "*_left.png"\n'
+    )
+    for seed, camera in enumerate(("left", "right")):
+        for k, frame in enumerate(noise(seed)):
+            cv2.imwrite(str(tmp_path / f"{k}_{camera}.png"), frame)
+    cv2.imwrite(str(tmp_path / "other.png"), noise(0)[0])
+    warnings = find_captures(tmp_path, sequence=tmp_path / "sequence.toml").warnings
+    assert any("other.png" in each for each in warnings)
+    assert not any("right.png" in each for each in warnings)
+
+
 def test_poses_called_left_and_right_are_two_poses(tmp_path, noise):
     (tmp_path / "sequence.toml").write_text(
         'projector = "96x64"\norder = "name"\n[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 4\n'

@@ -15,7 +15,7 @@ from slviewer.calibration.splined.half_turns import (
     is_numbering_ambiguous,
     renumber_poses,
 )
-from slviewer.calibration.splined.held_camera import HeldLens
+from slviewer.calibration.splined.held_camera import HeldCamera, HeldLens
 from slviewer.calibration.splined.normal import (
     BlockFactor,
     ObservedValues,
@@ -99,21 +99,22 @@ def adjust_bundle(
     progress: Callable[[float], None] | None = None,
     *,
     cells_across: int | None = None,
+    beside: Bundle | None = None,
 ) -> Bundle:
     """Adjust devices, board and poses jointly, from the observations that the stereo calibration
     used.
 
     ``cells_across``: cells of each displacement field across its image; by default
-    ``unknowns.CELLS_ACROSS``. Raises InputError as ``gather_data`` does, and CalibrationRejected
-    where the adjustment does not converge, is undetermined, or where too few poses agree with each
-    other.
+    ``unknowns.CELLS_ACROSS``. ``beside``: an adjustment of the same camera, board and poses with
+    another device, which are held: the projector alone is adjusted. Raises InputError as
+    ``gather_data`` does, and CalibrationRejected where the adjustment does not converge, is
+    undetermined, or where too few poses agree with each other.
     """
     names, data, sample_sigma = gather_data(observations, stereo)
     T = np.array([stereo.poses[name] for name in names])
     state = State.from_rig(stereo.rig, T, len(data.points), cells_across)
     layout = state.layout
-    held = HeldLens(stereo.known_camera, state.rig.camera, data.sample_px, layout.rig)
-    prior = Prior.build(state, data.points, held.gauge)
+    state, held, prior = _hold(state, data, stereo, beside, names)
     is_excluded = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
     certain = np.array(
@@ -197,6 +198,32 @@ def adjust_bundle(
             half_turned_poses=tuple(np.array(names)[half_turned].tolist()),
             camera=check,
         )
+
+
+def _hold(
+    state: State,
+    data: PoseData,
+    stereo: StereoModel,
+    beside: Bundle | None,
+    names: Sequence[str],
+) -> tuple[State, HeldLens | HeldCamera, Prior]:
+    """Return the initial state, what is held of it, and the prior: with the camera, the board and
+    the named poses of the adjustment ``beside``, if there is one."""
+    if beside is None:
+        held = HeldLens(stereo.known_camera, state.rig.camera, data.sample_px, state.layout.rig)
+        return state, held, Prior.build(state, data.points, held.gauge)
+    poses = [beside.poses.index(name) for name in names]
+    feature = scipy.spatial.cKDTree(beside.points).query(data.points)[1]
+    own = beside.state
+    state = State(
+        state.rig._replace(camera=own.rig.camera),
+        own.R_board[poses],
+        own.t_board[poses],
+        own.heights,
+        own.offsets[feature],
+    )
+    prior = Prior.build(state, data.points, None, beside.strengths[0])
+    return state, HeldCamera(state.layout), prior
 
 
 def _residuals(state: State, data: PoseData) -> ObservedValues:

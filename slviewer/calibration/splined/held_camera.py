@@ -1,12 +1,12 @@
-"""A camera's lens that the adjustment holds, what the poses say against it, and its part of the
-uncertainty."""
+"""What the adjustment holds: a camera's lens, with what the poses say against it, and its part of
+the uncertainty; or all but the projector, as two cameras were calibrated."""
 
 import cv2
 import numpy as np
 
 from slviewer.calibration.known_camera import CameraCheck, KnownCamera
 from slviewer.calibration.splined.normal import BlockFactor
-from slviewer.calibration.splined.unknowns import LENS, Device
+from slviewer.calibration.splined.unknowns import LENS, Device, UnknownLayout
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.splines import basis_matrix
@@ -70,6 +70,26 @@ class HeldLens:
         A[:first, lens], A[lens, first:] = above, beside
         A[lens, lens] = shared + stated
         return check
+
+
+class HeldCamera:
+    """The camera, the board and its poses in the normal equations, all held: the projector is
+    solved in their frame of reference, and may bend nothing of it."""
+
+    gauge = None
+
+    def __init__(self, layout: UnknownLayout) -> None:
+        self.held = np.r_[: layout.rig + LENS, layout.camera_field : layout.projector_field]
+
+    def take(self, A: Floats, b: Floats) -> None:
+        """Take all but the projector out of the equations, of which A has the upper triangle."""
+        self.taken = A.copy()
+        A[self.held] = A[:, self.held] = b[self.held] = 0.0
+        A[self.held, self.held] = 1.0
+
+    def release(self, A: Floats, b: Floats, factor: BlockFactor) -> None:
+        """Put back what the camera and the projector say of everything: their uncertainty."""
+        A[:] = self.taken
 
 
 def lens_like_fields(device: Device, lens: Lens, pixels: Floats) -> Floats:

@@ -2,13 +2,15 @@
 uncertainty."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.board_pose import solve_device
 from slviewer.calibration.known_camera import CameraCheck
+from slviewer.calibration.next_pose import nominal_lens
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.calibration.splined.adjust import adjust_bundle
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
@@ -32,13 +34,15 @@ from slviewer.calibration.splined.unknowns import (
     undistort,
 )
 from slviewer.calibration.stereo import DEVICES, StereoModel
+from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.rigid import Mask
+from slviewer.geometry.rigid import Mask, move_points, rigid_transform
 from slviewer.geometry.triangulation import check_map
-from slviewer.geometry.vectors import rms
+from slviewer.geometry.vectors import box_middle, finite_rows, rms
 from slviewer.records.calibration import SplinedFit, VolumeSigma
 from slviewer.records.plain import from_plain, to_plain
 
@@ -108,6 +112,7 @@ class SplinedModel:
         rays[0][unknown] = rays[1][unknown] = np.nan
         return rays
 
+    @cached_property
     def device_rays(self) -> tuple[np.ndarray, np.ndarray]:
         """Undistorted normalised coordinates (h, w, 2) of each pixel of both devices."""
         width, height = (int(n) for n in self.rig.projector.size)
@@ -314,3 +319,37 @@ def calibrate_splined(
     where they contradict each other.
     """
     return SplinedModel(adjust_bundle(observations, stereo, progress, cells_across=cells_across))
+
+
+def calibrate_projector(
+    pair: SplinedModel, observations: Sequence[Observation], size: tuple[int, int]
+) -> SplinedModel:
+    """Calibrate the projector of two cameras, whose model is ``pair``, in their frame of reference:
+    with the first camera, the board and its poses as they are there.
+
+    ``observations``: those of both cameras; their ``light`` is of the projector, whose ``size`` is
+    px. Its uncertainty is that of a camera and a projector calibrated from these poses alone.
+    Raises CalibrationRejected where they do not determine the projector, and as
+    ``calibrate_splined``.
+    """
+    bundle, opposite = pair.bundle, 2 * box_middle(pair.bundle.points)
+    used = list[Observation]()
+    for o in observations:
+        if o.light is not None and o.name in bundle.poses and o.name not in bundle.excluded:
+            points = opposite - o.points if o.name in bundle.half_turned_poses else o.points
+            used.append(replace(o.light, camera=o.camera, points=points))
+    if not used:
+        raise InputError("no target pose has patterns along both axes")
+    at = [bundle.poses.index(o.name) for o in used]
+    boards = map(rigid_transform, bundle.state.R_board[at], bundle.state.t_board[at])
+    poses = {o.name: T for o, T in zip(used, boards, strict=True)}
+    points = np.concatenate([move_points(poses[o.name], o.points) for o in used])
+    pixels = np.concatenate([o.projector for o in used])
+    seen = finite_rows(pixels)
+    # what moved through the volume is one body, with points all over it
+    K, D, (T,), _ = solve_device(
+        "projector", [points[seen]], [pixels[seen]], size, nominal_lens(size)
+    )
+    rig = StereoRig(pair.pinholes.camera, Lens(K, D, size), T[:3, :3], T[:3, 3])
+    start = replace(StereoModel.from_rig(rig), poses=poses)
+    return SplinedModel(adjust_bundle(used, start, beside=bundle))

@@ -121,6 +121,7 @@ class Prior:
 
     ``features_per_point``: how many of the board's features each offset of the state represents.
     ``camera_gauge``: unit rows of what the camera's field lacks, where its lens is held.
+    ``camera_strength``: where the camera's field is held too, what it was calibrated with.
     """
 
     forms: tuple[Floats, Floats]
@@ -128,13 +129,24 @@ class Prior:
     camera_gauge: Floats | None = None
     strengths: tuple[float, float] = (FIRST_STRENGTH, FIRST_STRENGTH)
     features_per_point: float = 1.0
+    camera_strength: float | None = None
 
     @classmethod
-    def build(cls, state: State, points: Floats, camera_gauge: Floats | None = None) -> "Prior":
+    def build(
+        cls,
+        state: State,
+        points: Floats,
+        camera_gauge: Floats | None = None,
+        camera_strength: float | None = None,
+    ) -> "Prior":
         """Build the prior for the fields' knots and the board's features at ``points`` (f, 3)
         mm."""
         camera, projector = (roughness(device.coefficients) for device in state.rig[:2])
-        return cls((camera, projector), offset_gauge(points), camera_gauge)
+        strengths = camera_strength or FIRST_STRENGTH, FIRST_STRENGTH
+        return cls(
+            (camera, projector), offset_gauge(points), camera_gauge, strengths,
+            camera_strength=camera_strength,
+        )  # fmt: skip
 
     def add(self, A: Floats, b: Floats, state: State) -> None:
         """Add to the upper triangle and the right-hand side."""
@@ -188,7 +200,7 @@ class Prior:
             determined = max(field.size - strength * trace, 1.0)
             energy = float(np.sum(field * (field @ form)))
             updated.append(float(np.clip(determined / max(energy, 1e-12), *STRENGTH_BOUNDS)))
-        return replace(self, strengths=(updated[0], updated[1]))
+        return replace(self, strengths=(self.camera_strength or updated[0], updated[1]))
 
     def _fields(self, state: State) -> Iterator[tuple[int, Floats, Floats, float]]:
         """Iterate over both fields: first unknown, coefficients (2, n), quadratic form (n, n), and

@@ -38,7 +38,6 @@ from slviewer.target.board import Board
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import CalibrationView
 
-DEVICES = ("camera", "projector")
 USUAL_WEIGHT = "80 % or more is usual"
 _MOST_NAMED = 6  # poses of a verdict that are offered as buttons: they fit on two lines
 _LEVELS: dict[str, tuple[Tone, str, str]] = {
@@ -94,7 +93,7 @@ class CalibratePanel(StepPanel):
             self._pose = self.choice("Pose")
             self._pose_note = Text(gui)
             self._exclude = self.button("Exclude this pose", self._toggle_pose)
-            self._device = self.dropdown("Residuals", DEVICES)
+            self._device = self.choice("Residuals")
             self._arrows = Plot(gui)
         with gui.add_folder("Parameters", expand_by_default=False) as self._parameters_folder:
             self._parameters = Text(gui)
@@ -133,6 +132,7 @@ class CalibratePanel(StepPanel):
         self._pose.offer_names(names, max(rms, key=rms.__getitem__, default=""))
         clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
         self._over.offer({"none": ""} | clouds)
+        self._device.offer({text: each for each, text in calibration.reprojection.devices.items()})
         if calibration.pixelwise:
             self._axis.offer_names(calibration.pixelwise.axes)
             self._fits.set(report_table(calibration.pixelwise.table()))
@@ -180,7 +180,7 @@ class CalibratePanel(StepPanel):
         self._compare.label = "Compare models" if compared is None else "Compare again"
         splined = Html("")
         if calibration.splined:
-            splined = report_table(calibration.splined.table())
+            splined = report_table(calibration.reprojection.rename(calibration.splined.table()))
         elif calibration.missing and not self._names_cause("too-few-poses"):
             splined = note(f"No splined model: {calibration.missing}.")
         self._comparison.set(records_html(found) + splined)
@@ -240,7 +240,8 @@ class CalibratePanel(StepPanel):
             self.painter.cancel(self._arrows.set)
             self._arrows.set(None)
             return
-        text = f"{name}, {calibration.label}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
+        other = calibration.reprojection.other
+        text = f"{name}, {calibration.label}: camera {rms[0]:.3f} px, {other} {rms[1]:.3f} px."
         if calibration.splined and name in calibration.splined.weights:
             camera, projector = calibration.splined.weights[name]
             weights = f"features {100 * camera:.0f} %, phase {100 * projector:.0f} %"
@@ -258,7 +259,9 @@ class CalibratePanel(StepPanel):
             if residuals is None:
                 return None
             return residual_arrows(
-                f"{name}, {device}, {model}", *residuals[device], getattr(rig, device).size
+                f"{name}, {calibration.reprojection.devices[device]}, {model}",
+                *residuals[device],
+                getattr(rig, device).size,
             )
 
         self.painter.request(self._arrows.set, (made, name, device), arrows)
@@ -372,7 +375,9 @@ def _summary(calibration: CalibrationView) -> Html:
     """Return a table of the calibration: errors, poses, depths, baseline and models."""
     stereo = calibration.stereo
     properties: dict[str, object] = {
-        f"Reprojection RMS, {device}": coloured(f"{rms:.3f} px", "plain", bold=True)
+        f"Reprojection RMS, {calibration.reprojection.devices[device]}": coloured(
+            f"{rms:.3f} px", "plain", bold=True
+        )
         for device, rms in calibration.reprojection.rms_px.items()
     }
     if properties:
@@ -391,7 +396,9 @@ def _summary(calibration: CalibrationView) -> Html:
 
 def _parameters(details: CalibrationFigures) -> Html:
     """Return tables of the lens and rig parameters with their standard deviations."""
-    return report_table(lens_table(details.stereo)) + report_table(rig_table(details.stereo))
+    tables = lens_table(details.stereo), rig_table(details.stereo)
+    lens, rig = (report_table(details.reprojection.rename(each)) for each in tables)
+    return lens + rig
 
 
 def verdict_html(
@@ -448,6 +455,7 @@ def exclusions_html(calibration: CalibrationView, verdict: Verdict | None) -> Ht
             f"{name}, in the splined model only: it {why}"
             for name, why in calibration.splined.excluded.items()
         ]
+    lines = [line.replace("projector", calibration.reprojection.other) for line in lines]
     html = Html("")
     if lines:
         items = "".join(

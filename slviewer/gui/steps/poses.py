@@ -49,10 +49,16 @@ _STATES: dict[str, tuple[Tone, Colour]] = {
 }
 """{state of a pose: tone of its name, colour of its board in 3D}."""
 _PICTURE_PX = 160
+_HEADING = "color:var(--mantine-color-dimmed);margin-bottom:0.2em"
+"""Style of the name of a chart."""
 
 
 def coverage_chart(coverage: Coverage) -> Html:
-    """Return three small charts side by side; a field is full once GOAL_POSES poses cover it."""
+    """Return three small charts side by side, that of a second camera's image below the first's; a
+    field is full once GOAL_POSES poses cover it."""
+    images = _draw_grid(coverage.cells)
+    if coverage.second is not None:
+        images += f'<div style="{_HEADING}">Second camera</div>{_draw_grid(coverage.second)}'
     depths = "".join(
         f'<div style="display:flex;align-items:center;gap:0.4em">{_draw_field(n, 44, 15)}'
         f"<span>{name}</span></div>"
@@ -63,10 +69,9 @@ def coverage_chart(coverage: Coverage) -> Html:
         tilts[place] = n
     near, far = coverage.range_mm
     charts = "".join(
-        f'<div><div style="color:var(--mantine-color-dimmed);margin-bottom:0.2em">{to_html(title)}'
-        f"</div>{chart}</div>"
+        f'<div><div style="{_HEADING}">{to_html(title)}</div>{chart}</div>'
         for title, chart in (
-            ("Image", _draw_grid(coverage.cells)),
+            ("Image", images),
             (f"Depth, {near:.0f}–{far:.0f} mm", depths),
             ("Tilt", _draw_grid(tilts, _TILTS)),
         )
@@ -285,8 +290,10 @@ class PosesPanel(StepPanel):
         ]
         if pose.rms_px:
             camera, projector = pose.rms_px
-            model = self.session.calibration.label if self.session.calibration else ""
-            rms = f"Reprojection RMS, {model}: camera {camera:.3f} px, projector {projector:.3f} px"
+            calibration = self.session.calibration
+            model = calibration.label if calibration else ""
+            other = calibration.reprojection.other if calibration else "projector"
+            rms = f"Reprojection RMS, {model}: camera {camera:.3f} px, {other} {projector:.3f} px"
             lines.append(to_html(rms))
         if pose.T_camera_board is not None:
             about = "" if pose.state == "used" else "about "

@@ -28,6 +28,7 @@ from slviewer.gui.widgets import (
 from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.pipeline.rig_choice import Choice, Preset, check_choice, presets
 from slviewer.server.viser_internals import make_private
+from slviewer.session.store import Session
 from slviewer.wizard.snapshot import PreviewView, RigView, SessionView
 
 SIMULATED: dict[str, dict[str, Any]] = {
@@ -35,11 +36,19 @@ SIMULATED: dict[str, dict[str, Any]] = {
     "Simulated, full size": {"driver": "simulated", "scale": 1.0},
     "Simulated, quarter size": {"driver": "simulated", "scale": 0.25},
 }
+_PLAIN = {"preset": "letter", "seed": 0}
+"""What a simulated rig is that does not say otherwise."""
 _CHOOSE, _CUSTOM, _REPLAY = "Choose …", "Custom …", "replay"
 _FIRST = "opencv"
 """The most common driver: a webcam."""
 _ADDRESSES = ("source", "serial", "number", "model")
 """Names of the drivers' options that choose one device among several."""
+
+
+def list_presets(session: Session | None) -> dict[str, Preset]:
+    """Return the presets by name, without those that are `SIMULATED` already."""
+    known = [_PLAIN | each for each in SIMULATED.values()]
+    return {each.name: each for each in presets(session) if {**_PLAIN, **each.choice} not in known}
 
 
 class RigChoice(PanelPart):
@@ -119,11 +128,7 @@ class RigChoice(PanelPart):
 
     def _offer_rigs(self) -> None:
         """Update the options from the rig presets; a choice that is no longer offered is reset."""
-        self._presets = {
-            p.name: p
-            for p in presets(self._operator.session)
-            if p.choice.get("driver") != "simulated" or "dlpc350" in p.choice
-        }
+        self._presets = list_presets(self._operator.session)
         options = (_CHOOSE, *SIMULATED, *self._presets, _CUSTOM)
         if tuple(self._choice.options) != options:
             value = self._choice.value

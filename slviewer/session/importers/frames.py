@@ -1,5 +1,4 @@
-"""Any folder of images, with a TOML that says what each of them shows; and that TOML of images that
-nobody described, as they themselves suggest it.
+"""Any folder of images, with a TOML that says what each of them shows.
 
 ```toml
 projector = "912x1140"   # width x height, px; not needed where only the phase is wanted
@@ -64,20 +63,21 @@ files = "white.png"
 A sequence that was taken in several exposures names them: each entry has `exposure_ms`, and every
 exposure has the same frames. They become one capture, in which each pixel comes from the longest
 exposure that did not saturate it.
+
+Of two cameras each entry says which one its files are of, `camera = "left"` or `camera = "right"`:
+all that the one saw, and the same frames of the other. Pixels of clouds are those of the left one.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import groupby
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import msgspec
 
 from slviewer.errors import InputError
-from slviewer.examination.guess import Guess, guess_sequence
 from slviewer.fringe.sequence import SEQUENCE_KEYS, Axis, Frame, Kind, PatternSequence, parse_size
-from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
+from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,
@@ -85,15 +85,14 @@ from slviewer.session.importers.imported import (
     collect_captures,
     has_wildcard,
     images_by_name,
-    list_folders,
     match_files,
-    unknown_files_warning,
 )
 from slviewer.session.names import join_names
 from slviewer.session.reading import read_toml
-from slviewer.session.toml import format_value, table_lines
 
 _KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
+CAMERAS = ("left", "right")
+"""What an entry's ``camera`` says of which of two its files are; the left is the first."""
 
 
 _Period = Annotated[float, msgspec.Meta(gt=0)]
@@ -300,7 +299,8 @@ class Description:
     """The content of a TOML that describes every capture of a source.
 
     `files_order`: index of each stack frame's file among the files of all groups.
-    `gray_origin_given`: whether the TOML states where Gray code 0 begins.
+    `gray_origin_given`: whether the TOML states where Gray code 0 begins. `second`: what the
+    entries of the right one of two cameras describe.
     """
 
     sequence: PatternSequence
@@ -309,6 +309,7 @@ class Description:
     exposures_ms: tuple[float, ...]
     channel: Channel | None
     gray_origin_given: bool
+    second: "Description | None" = None
 
     def select_files(self, folder: Path) -> tuple[Path, ...]:
         """Return the files of one capture in the order of its stack; InputError names missing or
@@ -385,9 +386,12 @@ def _read(
         recording = ImportableRecording(
             name, described.sequence, files, folder, settings, described.channel, exposures
         )
-        return recording, unknown_files_warning(
-            folder, sorted(set(images_by_name(folder)) - set(files))
-        )
+        if described.second is not None:
+            files = described.second.select_files(folder)
+            recording = replace(recording, second=replace(recording, files=files))
+            files += recording.files
+        unknown = sorted(set(images_by_name(folder)) - set(files))
+        return replace(recording, unknown=tuple(unknown)), []
 
     files = described.groups[0].files
     first = (
@@ -416,7 +420,54 @@ def read_description(toml: Path, projector: tuple[int, int] | None = None) -> De
             f"{toml.name} says that the projector is {data['projector']}, and"
             f" {projector[0]}x{projector[1]} was given: correct the one that is wrong"
         )
-    groups = read_groups(toml.name, data)
+    left, right = _split_cameras(toml.name, data)
+    first = _describe(toml.name, left, projector)
+    if right is None:
+        return first
+    second = _describe(toml.name, right, projector)
+    if second.sequence != first.sequence or second.exposures_ms != first.exposures_ms:
+        raise InputError(
+            f"{toml.name}: the entries of the left and of the right camera describe other frames:"
+            " both saw the same patterns, in the same order"
+        )
+    return replace(first, second=second)
+
+
+def _split_cameras(
+    name: str, data: Mapping[str, Any]
+) -> tuple[Mapping[str, Any], Mapping[str, Any] | None]:
+    """Return the content of a TOML for the left and for the right camera, without the entries
+    ``camera``; None for the right one where no entry says so. Raises InputError where only some
+    do."""
+    key = "frames" if "frames" in data else "frame"
+    entries = data.get(key)
+    tables = entries if isinstance(entries, list) else []
+    named = [each.get("camera") for each in tables if isinstance(each, Mapping)]
+    if not any(named):
+        return data, None
+    for number, camera in enumerate(named, 1):
+        if camera not in CAMERAS:
+            raise InputError(
+                f'{name}, [[{key}]] {number}: camera is {camera!r}: write "left" or "right" in'
+                " every entry, or in none"
+            )
+    left, right = (
+        {
+            **data,
+            key: [
+                {word: value for word, value in each.items() if word != "camera"}
+                for each, named_camera in zip(tables, named, strict=True)
+                if named_camera == camera
+            ],
+        }
+        for camera in CAMERAS
+    )
+    return left, right
+
+
+def _describe(name: str, data: Mapping[str, Any], projector: tuple[int, int] | None) -> Description:
+    """What the entries of one camera in the TOML ``name`` describe."""
+    groups = read_groups(name, data)
     try:
         exposures, order = _list_exposures(groups)
         frames = [frame for group in groups for frame in group.frames]
@@ -424,7 +475,7 @@ def read_description(toml: Path, projector: tuple[int, int] | None = None) -> De
         size = {"projector": projector} if projector else {}
         sequence = PatternSequence.from_dict({**data, **size, "frame": shown})
     except InputError as error:
-        raise InputError(f"{toml.name}: {error}") from error
+        raise InputError(f"{name}: {error}") from error
     return Description(
         sequence, groups, tuple(order), exposures, data.get("channel"), "gray_origin" in data
     )
@@ -458,118 +509,3 @@ def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], li
 LAYOUT = FolderLayout(
     "frames", "images and a TOML that describes them", _read, lambda folder: False
 )
-
-
-@dataclass(frozen=True)
-class GuessedDescription:
-    """``toml``: the text, whose comments say what supports each entry. ``summary``: a line for each
-    group of images, and the assumptions. ``doubts``: what stays open; empty where the description
-    is sure. ``is_complete``: whether every image is described, so that the TOML can be imported."""
-
-    toml: str
-    summary: tuple[str, ...]
-    doubts: tuple[str, ...]
-    is_complete: bool
-
-
-def guess_description(
-    folder: Path, projector: str | None, channel: Channel | None
-) -> GuessedDescription:
-    """Guess the pattern sequence of a folder's images, in natural order of their names, as a TOML
-    with doubts; nothing is saved. ``projector``: width x height, px, where it is known.
-
-    Of a folder of captures, the first is read. Raises InputError where there are no images, or they
-    cannot belong to one capture (other sizes, damaged).
-    """
-    source, files = folder, list[Path]()
-    for folder in list_folders(source):
-        if len(files := images_by_name(folder)) >= 3:
-            break
-    else:
-        raise InputError(
-            f"{source} and the folders in it hold fewer than three images: give the folder of a"
-            " capture"
-        )
-    images = read_frames(files, channel=channel or DEFAULT_CHANNEL)
-    size = None if projector is None else parse_size(projector)
-    guess = guess_sequence(images.stack, size)
-    names = [file.name for file in files]
-    shown = (channel or DEFAULT_CHANNEL) if images.in_colour else channel
-    other = "; the green of these colour images was read: try --channel red, blue or max"
-    hint = other if images.in_colour and channel is None and not any(guess.frames) else ""
-    doubts = tuple(
-        f"{_format_span(names, indices)}: {text}{hint}" for indices, text in guess.doubts
-    )
-    toml = _format_toml(folder, names, guess, shown, size, doubts)
-    summary = (*_summarise_frames(names, guess.frames), *guess.notes)
-    return GuessedDescription(toml, summary, doubts, guess.sequence is not None)
-
-
-def _summarise_frames(names: list[str], frames: Sequence[Frame | None]) -> list[str]:
-    """Return a line for each group of neighbouring images of one kind and axis."""
-
-    def describe(index: int) -> str:
-        """Return what an image shows, the same for all images of a group."""
-        frame = frames[index]
-        if frame is None:
-            return "not identified"
-        along = f" along {frame.axis}" if frame.axis else ""
-        if frame.kind == "phase":
-            return f"{frame.steps} phase steps{along}, period {frame.period_px:g} px"
-        if frame.kind in ("gray", "inverse"):
-            return f"Gray code of {frame.bits} bits{along}"
-        return f"{frame.kind}{along}"
-
-    groups = groupby(range(len(names)), key=describe)
-    return [f"{_format_span(names, tuple(images))}: {text}" for text, images in groups]
-
-
-def _format_span(names: list[str], indices: tuple[int, ...]) -> str:
-    """Format the names at some indices: "first to last" where they are consecutive, else a list."""
-    whole = len(indices) > 1 and indices == tuple(range(indices[0], indices[-1] + 1))
-    return (
-        f"{names[indices[0]]} to {names[indices[-1]]}"
-        if whole
-        else join_names([names[i] for i in indices])
-    )
-
-
-def _format_toml(
-    folder: Path,
-    names: list[str],
-    guess: Guess,
-    channel: Channel | None,
-    projector: tuple[int, int] | None,
-    doubts: tuple[str, ...],
-) -> str:
-    """Return the text of the guessed TOML, with comments for its evidence and doubts."""
-    described = guess.sequence.to_dict() if guess.sequence else {}
-    lines = [f"# Guessed from the {len(names)} images of {folder.name}."]
-    lines += [f"# UNSURE: {doubt}" for doubt in doubts]
-    lines += [f"# {note}" for note in guess.notes]
-    if projector is None:
-        lines.append('# projector = "1280x800"  # unknown: needed to calibrate and to reconstruct')
-    else:
-        lines.append(f'projector = "{projector[0]}x{projector[1]}"')
-    lines.append('order = "name"  # all images of a folder in natural order of their names')
-    if channel is not None:
-        lines.append(f"channel = {format_value(channel)}")
-    # Without gray_origin the import estimates it from the images.
-    keys = ("phase_sign", "phase_offset", "gray_cell_px", "relative")
-    lines += table_lines({key: described[key] for key in keys if key in described})
-    evidence: dict[int, list[str]] = {}
-    for image, text in guess.evidence:
-        evidence.setdefault(image, []).append(text)
-    doubtful = {
-        image: text for images, text in guess.doubts if len(images) < len(names) for image in images
-    }
-    for index, (name, frame) in enumerate(zip(names, guess.frames, strict=True)):
-        lines += ["", *(f"# {text}" for text in evidence.get(index, []))]
-        if index in doubtful:
-            lines.append(f"# UNSURE: {doubtful[index]}")
-        if frame is None:
-            lines.append(f"# [[frame]] of {name}: add its kind")
-            continue
-        lines.append(f"[[frame]]  # {name}")
-        lines += table_lines(frame.to_dict())
-    return "\n".join(lines) + "\n"

@@ -38,6 +38,12 @@ class ImportableRecording:
     channel: Channel | None = None  # of colour frames; None: the default
     exposures_ms: tuple[float, ...] = ()
     second: "ImportableRecording | None" = None  # of a second camera
+    unknown: tuple[Path, ...] = ()  # images beside these that the layout does not know
+
+    def read_channel(self, channel: Channel) -> "ImportableRecording":
+        """Return the recording with another channel of colour frames, of both cameras."""
+        second = None if self.second is None else self.second.read_channel(channel)
+        return replace(self, channel=channel, second=second)
 
     def read(self) -> NewCapture:
         """The capture with its frames; InputError where an image cannot be used.
@@ -87,9 +93,19 @@ class Imports:
     one."""
 
     recordings: Sequence[ImportableRecording]
-    warnings: Sequence[str]  # files and folders that were not used
+    messages: Sequence[str]  # warnings of the layout
     # captures whose files are missing, double or contradict the layout
     skipped: Sequence[Skipped] = ()
+
+    @property
+    def warnings(self) -> list[str]:
+        """The layout's messages, and which files and folders were not used."""
+        unknown = (
+            message
+            for each in self.recordings
+            for message in unknown_files_warning(each.source, each.unknown)
+        )
+        return [*self.messages, *unknown]
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -318,15 +334,21 @@ _CAMERAS = tuple(
 def pair_cameras(imports: Imports) -> Imports:
     """Join the captures of two cameras, if that is what all captures of a source are: those of the
     first have a name with left, L, cam0 or camera0 in it, of the folder or of every file, and each
-    of their files has a namesake with right, R, cam1 or camera1."""
+    of their files has a namesake with right, R, cam1 or camera1. Where a description names the
+    cameras, nothing is joined by names."""
+    if any(each.second for each in imports.recordings):
+        return imports
     pairs = [pair for each in imports.recordings if (pair := _find_pair(each))]
     of_second = {file for pair in pairs if pair.second for file in pair.second.files}
     own = {file for pair in pairs for file in pair.files}
     if not pairs or any(own.union(of_second).isdisjoint(each.files) for each in imports.recordings):
         return imports
     text = f"{join_names([pair.name for pair in pairs], 3)}: taken by two cameras, by their names"
-    told = [each for each in imports.warnings if not any(f.name in each for f in of_second)]
-    return replace(imports, recordings=pairs, warnings=[*told, text])
+    pairs = [
+        replace(pair, unknown=tuple(file for file in pair.unknown if file not in of_second))
+        for pair in pairs
+    ]
+    return replace(imports, recordings=pairs, messages=[*imports.messages, text])
 
 
 def _find_pair(recording: ImportableRecording) -> ImportableRecording | None:

@@ -107,8 +107,10 @@ def _read_graycode(
         shown_sequence = _fit_sequence(sequence, len(files), optional=2)
         files = _order_shadow_images(files, shown_sequence)
         unknown = [file for file in images_by_name(folder) if file not in files]
-        recording = ImportableRecording(name, shown_sequence, tuple(files), folder)
-        return recording, unknown_files_warning(folder, unknown)
+        recording = ImportableRecording(
+            name, shown_sequence, tuple(files), folder, unknown=tuple(unknown)
+        )
+        return recording, []
 
     def looks_so(folder: Path) -> bool:
         """Return whether a folder holds more than half of the images of a capture."""
@@ -203,8 +205,8 @@ def _define_numbered(
         """Return the recording of one folder, and warnings."""
         images, others = match_images(folder, pattern)
         sequence, files = order(images, projector, **options)
-        recording = ImportableRecording(name, sequence, tuple(files), folder)
-        return recording, unknown_files_warning(folder, others)
+        recording = ImportableRecording(name, sequence, tuple(files), folder, unknown=tuple(others))
+        return recording, []
 
     return define_layout(
         name, holds, describe, lambda folder: has_images(folder, pattern), **projector
