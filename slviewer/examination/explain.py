@@ -334,8 +334,8 @@ def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -
 
 
 def _explain_single_images(evaluator: Evaluator, base: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield what single phase steps show instead of their own step; the others of their period
-    decode in spite of them, so that a search by the others does not find them."""
+    """Yield what single images show instead of their own step or bit; the others decode in spite of
+    them, so that a search by the others does not find them."""
     shows, strange = _read_steps(evaluator, base)
     sequence = base.sequence
     if not shows and not strange:
@@ -389,8 +389,8 @@ def _list_copies(evaluator: Evaluator, sequence: PatternSequence) -> list[tuple[
 
 
 def _read_steps(evaluator: Evaluator, base: Hypothesis) -> tuple[dict[int, int], list[int]]:
-    """Return the frame that each phase step shows which does not show its own, and the steps that
-    show none of their axis."""
+    """Return the frame that each phase step or bit shows which does not show its own, and the steps
+    that show none of their axis: blur makes bits unlike any."""
     shows, strange = dict[int, int](), list[int]()
     for axis, sample, m, good in evaluator.explained(base):
         groups = evaluator.atoms(base, axis).groups[m.places]
@@ -399,16 +399,17 @@ def _read_steps(evaluator: Evaluator, base: Hypothesis) -> tuple[dict[int, int],
         own = m.predicted[:, good]
         squares = [np.einsum("kp,kp->k", a, a) for a in (shown, own)]
         residual = (squares[0][:, None] - 2 * shown @ own.T + squares[1]) / own.shape[1]
-        for group in range(groups.max() + 1):
-            steps = np.flatnonzero(groups == group)
+        for group in {*groups.tolist()}:
+            steps, is_code = np.flatnonzero(groups == group), group < 0
             usual = float(np.median(residual[steps, steps])) if len(steps) > 3 else np.inf
             for k in steps:
                 j, left = int(residual[k].argmin()), float(residual[k, k])
                 if left < limits.MISPLACED * usual + limits.MISPLACED_LEAST:
                     continue
-                if residual[k, j] < limits.LEFT_OF_FRAMES * left:
+                is_sure = not is_code or residual[k, j] < limits.UNLIKE_ANY_LEAST
+                if is_sure and residual[k, j] < limits.LEFT_OF_FRAMES * left:
                     shows[m.images[k]] = m.images[j]
-                elif left > limits.UNLIKE_ANY * usual + limits.UNLIKE_ANY_LEAST:
+                elif not is_code and left > limits.UNLIKE_ANY * usual + limits.UNLIKE_ANY_LEAST:
                     strange.append(m.images[k])
     return shows, strange
 

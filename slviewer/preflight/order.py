@@ -1,4 +1,4 @@
-"""Is frame k of a capture pattern k? A burst of coded frames decides."""
+"""Is frame k of a capture pattern k?"""
 
 from dataclasses import replace
 from typing import Any
@@ -57,9 +57,15 @@ def judge_order(sequence: PatternSequence, examination: Examination) -> Check:
     if found[0].cause == "frame-lag" and found[0].value:
         figures["lag"] = int(found[0].value)
     findings = "; ".join(dict.fromkeys(f.sentence for f in found[:3]))
-    remedy = f"{found[0].remedy[:1].upper()}{found[0].remedy[1:]}."
-    verdict: CheckVerdict = "bad" if examination.rejected else "warning"
+    remedy = format_remedy(found[0].remedy)
+    is_rejected = any(f.severity == "rejected" for f in found)
+    verdict: CheckVerdict = "bad" if is_rejected else "warning"
     return Check("order", verdict, f"Of {n} frames, {findings}.", remedy, figures)
+
+
+def format_remedy(text: str) -> str:
+    """Return a remedy, or another part of a message, as a sentence."""
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def check_burst(bench: RigUnderTest) -> Check:
@@ -83,8 +89,7 @@ def check_burst(bench: RigUnderTest) -> Check:
         burst = capture_frames(replace(rig, bursts=True), sequence)
     except DeviceError as error:
         what, _, remedy = str(error).rpartition(": ")
-        sentence, remedy = (f"{part[:1].upper()}{part[1:]}." for part in (what, remedy))
-        return Check("burst", "bad", sentence, remedy, figures)
+        return Check("burst", "bad", format_remedy(what), format_remedy(remedy), figures)
     bursts, singles = (
         stack[:, :: bench.stride, :: bench.stride][:, bench.illuminated].astype(np.float32)
         for stack in (burst, single)

@@ -21,7 +21,12 @@ from slviewer.pipeline.examination import examine_frames, name_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.preflight.light import MAX_NONLINEARITY
-from slviewer.preflight.order import MISPLACING_CAUSES, check_repeats, judge_order
+from slviewer.preflight.order import (
+    MISPLACING_CAUSES,
+    check_repeats,
+    format_remedy,
+    judge_order,
+)
 from slviewer.records.verdict import LIGHT_CAUSES, Cause, Examination
 from slviewer.session.capture import Capture
 
@@ -96,10 +101,10 @@ def _check_description(
         verdict: CheckVerdict = "bad" if examination.rejected else "warning"
         remedy = "; ".join(dict.fromkeys(f.remedy for f in found))
         sentence = _join_findings([f.sentence for f in found])
-        return Check("description", verdict, sentence, _format_remedy(remedy), {})
+        return Check("description", verdict, sentence, format_remedy(remedy), {})
     if error:
         text, _, remedy = str(error).removeprefix(f"{name}: ").rpartition(": ")
-        return Check("description", "bad", _join_findings([text]), _format_remedy(remedy), {})
+        return Check("description", "bad", _join_findings([text]), format_remedy(remedy), {})
     return Check(
         "description", "good", "The frames agree with the description of the patterns.", "", {}
     )
@@ -232,12 +237,6 @@ def _list_sentences(examination: Examination, *causes: Cause) -> list[str]:
     return [f.sentence for f in examination.findings if f.cause in causes]
 
 
-def _format_remedy(text: str) -> str:
-    """Return a remedy as a sentence."""
-    return f"{text[:1].upper()}{text[1:]}."
-
-
 def _join_findings(findings: Sequence[str]) -> str:
     """Join findings, each once, to a sentence."""
-    text = "; ".join(dict.fromkeys(findings))
-    return f"{text[0].upper()}{text[1:]}."
+    return format_remedy("; ".join(dict.fromkeys(findings)))
