@@ -96,11 +96,16 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
         return ()
     # one that accounts for all images, rather than one that leaves some out
     first, *others = rated
+    most_left, k = first.most_left, first.hypotheses[0].excluded
+    if k is not None:  # all images are compared, that one too
+        j = _identify_pattern(evaluator, first.hypotheses[0], k)
+        left = _measure_left(evaluator, first.hypotheses[0], k, j)
+        most_left = min(most_left, float(left.mean()) + limits.LEFT_LEAST)
     complete = [
         r
         for r in others
         if r.net + gained > limits.RIVAL * (first.net + gained)
-        and r.comparison.left < first.most_left
+        and r.comparison.left < most_left
         and not r.hypotheses[0].loses_images
     ]
     for each in (first, *complete):
@@ -271,19 +276,18 @@ def _measure_left(
     evaluator: Evaluator, hypothesis: Hypothesis, k: int, j: int | None
 ) -> np.ndarray:
     """Return the share (p,) of the variance of all images that is left at each pixel if image k,
-    which the hypothesis leaves out, shows the pattern of frame j of its axis; None: no pattern."""
+    which the hypothesis leaves out, shows the pattern of frame j of its axis; None: even light."""
     losses = list[np.ndarray]()
     for axis, sample in evaluator.sample.by_axis.items():
         if (m := evaluator.match(hypothesis, axis)) is None:
             continue
         atoms, residuals = evaluator.atoms(hypothesis, axis), [*m.residual(sample)]
         if k in atoms.frames:
-            seen = sample.levels[k, 1]
-            shown = seen.mean()
+            seen = sample.levels[k, 1] - m.background
+            pattern = seen @ m.contrast / max(float(m.contrast @ m.contrast), 1e-6)
             if j is not None:
                 pattern = atoms.at(m.coordinate)[atoms.frames.index(j)]
-                shown = m.background + m.contrast * pattern
-            residuals.append(seen - shown)
+            residuals.append(seen - m.contrast * pattern)
         total = sample.levels[atoms.frames, 1].var(axis=0) * len(atoms.frames)
         left = np.sum(np.square(residuals), axis=0) / np.maximum(total, 1e-6)
         losses.append(np.minimum(left, 1))
