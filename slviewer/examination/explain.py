@@ -1,7 +1,7 @@
 """Search for the hypothesis that explains the images of a capture best."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
@@ -33,7 +33,12 @@ def explain(evaluator: Evaluator, base: Hypothesis) -> Explanation:
         if found and (found[0].axis or found[0].cause == "step-order"):
             copies = _list_copies(evaluator, base.sequence)
             if 0 < len(copies) <= limits.MOST_SINGLE:
-                return tuple(_repeat(base.sequence, *pair) for pair in copies)
+                copied = dict(copies)
+                images = [None if i in copied else i for i in base.images]
+                others = replace(base, images=tuple(images), cost=0.0)
+                explained = _rate(evaluator, base, found)
+                if _rate(evaluator, base, (others,)).comparison.left < explained.most_left:
+                    return tuple(_repeat(base.sequence, *pair) for pair in copies)
     return found or tuple(_explain_single_images(evaluator, base))
 
 
@@ -43,13 +48,16 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
     for axis, sample, m, good in evaluator.explained(base):
         bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
         residual = (m.residual(sample) / m.contrast.clip(1e-3))[:, good].clip(-1, 1)
-        for i in reversed(bits):
-            k = m.images.index(i)
-            own = m.predicted[k, good] - m.predicted[k, good].mean()
-            contrast = 1 + float(own @ residual[k]) / max(float(own @ own), 1e-6)
-            if not abs(contrast) < limits.UNRESOLVED:
+        pairs = [*zip(bits, inverse, strict=True)] if inverse else [(i,) for i in bits]
+        for pair in reversed(pairs):
+            places = [m.images.index(i) for i in pair]
+            own = m.predicted[places][:, good]
+            own = own - own.mean(axis=1, keepdims=True)
+            squares = np.maximum(np.einsum("kp,kp->k", own, own), 1e-6)
+            contrasts = 1 + np.einsum("kp,kp->k", own, residual[places]) / squares
+            if not (np.abs(contrasts) < limits.UNRESOLVED).all():
                 break
-            out += [i, *(inverse[b] for b, j in enumerate(bits) if j == i and inverse)]
+            out += pair
     return out
 
 
@@ -88,11 +96,16 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
         return ()
     # one that accounts for all images, rather than one that leaves some out
     first, *others = rated
+    most_left, k = first.most_left, first.hypotheses[0].excluded
+    if k is not None:  # all images are compared, that one too
+        j = _identify_pattern(evaluator, first.hypotheses[0], k)
+        left = _measure_left(evaluator, first.hypotheses[0], k, j)
+        most_left = min(most_left, float(left.mean()) + limits.LEFT_LEAST)
     complete = [
         r
         for r in others
         if r.net + gained > limits.RIVAL * (first.net + gained)
-        and r.comparison.left < first.most_left
+        and r.comparison.left < most_left
         and not r.hypotheses[0].loses_images
     ]
     for each in (first, *complete):
@@ -226,27 +239,59 @@ def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained:
 
 
 def _choose_strange(evaluator: Evaluator, rated: Sequence[_Rated]) -> Explanation:
-    """Return, of frames without which the others fit about equally well, the one that fits least
+    """Return, of frames that show something else, the one that explains all images best, and of
+    about equally likely ones one that repeats an earlier frame, else the one that fits least
     itself; empty where blur or the projector's response explains why it does not fit."""
-    rivals = list[tuple[float, float, Hypothesis]]()
+    rivals = list[tuple[bool, float, np.ndarray, Hypothesis]]()
     for each in rated:
         first = each.hypotheses[0]
-        if first.excluded is not None and each.net > limits.RIVAL * rated[0].net:
-            residual = _measure_strangeness(evaluator, first, first.excluded)
+        k = first.excluded
+        if k is not None and each.net > limits.RIVAL * rated[0].net:
+            residual = _measure_strangeness(evaluator, first, k)
             share = each.net / each.comparison.loss
-            if share > limits.STRANGE_SHARE or residual > limits.VERY_STRANGE:
-                rivals.append((residual, each.comparison.left, first))
-    rivals = [rival for rival in rivals if rival[0] > 0]
+            if residual > (0 if share > limits.STRANGE_SHARE else limits.VERY_STRANGE):
+                j = _identify_pattern(evaluator, first, k)
+                left = _measure_left(evaluator, first, k, j)
+                is_late = j is not None and j < k
+                rivals.append((is_late, residual, left, replace(first, frames=(k,), value=j)))
     if not rivals:
         return ()
-    least = min(left for _, left, _ in rivals)
-    most = limits.AS_LITTLE * least + limits.AS_LITTLE_LEAST
-    likely = [rival for rival in rivals if rival[1] < most]
-    hypothesis = max(likely, key=lambda rival: rival[0])[2]
-    k, sequence = hypothesis.frames[0], hypothesis.sequence
-    j = _identify_pattern(evaluator, hypothesis, k)
-    cause: Cause = "frame-order" if j is not None and j > k else "duplicate-frame"
-    return (Hypothesis(cause, sequence, (), (k,), value=j),)
+    least = min((left for *_, left, _ in rivals), key=np.mean)
+
+    def is_likely(left: np.ndarray) -> bool:
+        """Return whether a loss (p,) is the least one but for chance."""
+        more = left - least
+        return bool(more.mean() <= limits.SIGMAS_OF_RIVAL * more.std() / np.sqrt(len(more)))
+
+    likely = [rival for rival in rivals if is_likely(rival[2])]
+    found = max(likely, key=lambda rival: rival[:2])[3]
+    shown = found.value
+    cause: Cause = (
+        "frame-order" if shown is not None and shown > found.frames[0] else "duplicate-frame"
+    )
+    return (replace(found, cause=cause, images=()),)
+
+
+def _measure_left(
+    evaluator: Evaluator, hypothesis: Hypothesis, k: int, j: int | None
+) -> np.ndarray:
+    """Return the share (p,) of the variance of all images that is left at each pixel if image k,
+    which the hypothesis leaves out, shows the pattern of frame j of its axis; None: even light."""
+    losses = list[np.ndarray]()
+    for axis, sample in evaluator.sample.by_axis.items():
+        if (m := evaluator.match(hypothesis, axis)) is None:
+            continue
+        atoms, residuals = evaluator.atoms(hypothesis, axis), [*m.residual(sample)]
+        if k in atoms.frames:
+            seen = sample.levels[k, 1] - m.background
+            pattern = seen @ m.contrast / max(float(m.contrast @ m.contrast), 1e-6)
+            if j is not None:
+                pattern = atoms.at(m.coordinate)[atoms.frames.index(j)]
+            residuals.append(seen - m.contrast * pattern)
+        total = sample.levels[atoms.frames, 1].var(axis=0) * len(atoms.frames)
+        left = np.sum(np.square(residuals), axis=0) / np.maximum(total, 1e-6)
+        losses.append(np.minimum(left, 1))
+    return np.concatenate(losses)
 
 
 def _read_image(
@@ -293,8 +338,8 @@ def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -
 
 
 def _explain_single_images(evaluator: Evaluator, base: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield what single phase steps show instead of their own step; the others of their period
-    decode in spite of them, so that a search by the others does not find them."""
+    """Yield what single images show instead of their own step or bit; the others decode in spite of
+    them, so that a search by the others does not find them."""
     shows, strange = _read_steps(evaluator, base)
     sequence = base.sequence
     if not shows and not strange:
@@ -348,8 +393,8 @@ def _list_copies(evaluator: Evaluator, sequence: PatternSequence) -> list[tuple[
 
 
 def _read_steps(evaluator: Evaluator, base: Hypothesis) -> tuple[dict[int, int], list[int]]:
-    """Return the frame that each phase step shows which does not show its own, and the steps that
-    show none of their axis."""
+    """Return the frame that each phase step or bit shows which does not show its own, and the steps
+    that show none of their axis: blur makes bits unlike any."""
     shows, strange = dict[int, int](), list[int]()
     for axis, sample, m, good in evaluator.explained(base):
         groups = evaluator.atoms(base, axis).groups[m.places]
@@ -358,16 +403,17 @@ def _read_steps(evaluator: Evaluator, base: Hypothesis) -> tuple[dict[int, int],
         own = m.predicted[:, good]
         squares = [np.einsum("kp,kp->k", a, a) for a in (shown, own)]
         residual = (squares[0][:, None] - 2 * shown @ own.T + squares[1]) / own.shape[1]
-        for group in range(groups.max() + 1):
-            steps = np.flatnonzero(groups == group)
+        for group in {*groups.tolist()}:
+            steps, is_code = np.flatnonzero(groups == group), group < 0
             usual = float(np.median(residual[steps, steps])) if len(steps) > 3 else np.inf
             for k in steps:
                 j, left = int(residual[k].argmin()), float(residual[k, k])
                 if left < limits.MISPLACED * usual + limits.MISPLACED_LEAST:
                     continue
-                if residual[k, j] < limits.LEFT_OF_FRAMES * left:
+                is_sure = not is_code or residual[k, j] < limits.UNLIKE_ANY_LEAST
+                if is_sure and residual[k, j] < limits.LEFT_OF_FRAMES * left:
                     shows[m.images[k]] = m.images[j]
-                elif left > limits.UNLIKE_ANY * usual + limits.UNLIKE_ANY_LEAST:
+                elif not is_code and left > limits.UNLIKE_ANY * usual + limits.UNLIKE_ANY_LEAST:
                     strange.append(m.images[k])
     return shows, strange
 

@@ -11,7 +11,7 @@ from slviewer.examination.evaluate import Evaluator, Hypothesis, described
 from slviewer.examination.hypotheses import change_conventions, scale_finest_period
 from slviewer.examination.sample import CaptureSample
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
-from slviewer.fringe.frame_light import FrameLight, Term
+from slviewer.fringe.frame_light import FrameLight, Term, list_shifts
 from slviewer.fringe.layout import Layout, axis_layout
 from slviewer.fringe.levels import layout_levels
 from slviewer.fringe.origin import LATEST_TURNS
@@ -376,6 +376,8 @@ def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Fin
     gain = light.gain[used]
     span = float(gain.max() / gain.min()) - 1
     wave = float(np.sqrt(np.mean(light.wave**2)))
+    # without phase steps motion is not measured
+    moving = "" if list_shifts(sequence) else ", or a scene that comes nearer or moves away"
     if "wave" in light.terms and wave > limits.REPORTED / 3:
         text = (
             f"the light varies from image row to image row by {100 * np.sqrt(2) * wave:.0f} %, in"
@@ -386,7 +388,7 @@ def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Fin
     if "gain" in light.terms and span > limits.REPORTED:
         text = (
             f"the brightness varies by {100 * span:.1f} % among frames of a kind (automatic"
-            " exposure, or an unsteady lamp), which is corrected"
+            f" exposure, or an unsteady lamp{moving}), which is corrected"
         )
         frame = used[int(np.argmax(np.abs(np.log(gain))))]
         yield _of_light("exposure-drift", text, frame)

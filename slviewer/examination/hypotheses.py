@@ -27,7 +27,7 @@ def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
     """Yield the orders that cameras and projectors make: a lag, a lost image, an exchange of
     neighbours, a frame that shows something else, and other orders of few phase steps."""
     n = len(sequence.frames)
-    for lag in (1, 2, -1):
+    for lag in (1, 2, 3, -1):
         images = [i + lag if 0 <= i + lag < n else None for i in range(n)]
         yield _order("frame-lag", sequence, images, value=lag)
     kinds = [frame.kind for frame in sequence.frames]

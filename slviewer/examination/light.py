@@ -9,24 +9,30 @@ selected, and nothing is corrected that the frames' means, or the match of the p
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, Hypothesis, described
+from slviewer.examination.frame_means import evaluate_waves, measure_unequal_means, shows_wave
 from slviewer.examination.sample import CaptureSample, Sample, sample_capture
 from slviewer.fringe.frame_light import FrameLight, Term, estimate_albedo, list_shifts
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.sequence import Axis, PatternSequence
 
-MODELS: tuple[tuple[Term, ...], ...] = (
-    ("room",), ("gain",), ("wave",), ("gain", "wave"), ("gain", "room")
+Variation = Term | Literal["drift"]
+"""A term of the light, or gains that grow or fade steadily."""
+MODELS: tuple[tuple[Variation, ...], ...] = (
+    ("drift",), ("room",), ("gain",), ("wave",), ("gain", "wave"), ("gain", "room")
 )  # fmt: skip
-VALUES: dict[Term, tuple[str, ...]] = {
-    "gain": ("gain",), "wave": ("cosine", "sine"), "room": ("uniform", "albedo", "rows", "columns")
+VALUES: dict[Variation, tuple[str, ...]] = {
+    "gain": ("gain",), "wave": ("cosine", "sine"),
+    "room": ("uniform", "albedo", "rows", "columns"), "drift": ("gain",),
 }  # fmt: skip
-"""Unknowns of each term: one a frame; of room light one for all frames from its change on."""
+"""Unknowns of each term: one a frame; of a drift its rate, and of room light one for all frames
+from its change on."""
 PRIORS = {
     "gain": 0.3, "cosine": 0.1, "sine": 0.1, "uniform": 30.0, "albedo": 1.0, "rows": 1.0,
     "columns": 1.0, "level": 0.3,
@@ -89,9 +95,9 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
         if terms == ("gain",):  # misread bits lead astray from equal light, few fringes from means
             other = _fit(fitted, base, terms, _start_from_means(fitted, base))
             gains = light = min(light, other, key=lambda x: _score(judged, base, x, first))
-        if len(terms) > 1 and not _is_large(base.sequence, light, "gain"):
-            light = replace(light, gain=constant.gain, terms=terms[1:])
-        is_large = _is_large(base.sequence, light, terms[-1])
+        if len(terms) > 1 and not _is_large(base.sequence, stack, light, "gain"):
+            light = replace(light, gain=constant.gain, terms=light.terms[1:])
+        is_large = _is_large(base.sequence, stack, light, terms[-1])
         own = _score(judged, base, light, first)
         if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
@@ -140,10 +146,9 @@ def _accept(
     """Return the light of best ``score`` if it is to be corrected; else equal light, with the terms
     of one that is neither refuted nor explains enough."""
     constant = FrameLight.constant(len(stack))
-    before, after, claimed = _measure_unequal_means(sequence, stack, light)
+    before, after, claimed = measure_unequal_means(sequence, stack, light)
     is_refuted = after > limits.REFUTED * before + limits.REFUTED_LEAST
     is_refuted |= claimed > 3 * before + limits.CONFIRMED_LEAST
-    is_refuted |= "wave" in light.terms and not _shows_wave(sequence, stack, light)
     is_strange = np.abs(np.log(light.gain)).max() > limits.FARTHEST_GAIN
     # means that differ anyway, of few fringes in view, refute nothing that explains much
     is_final = before < limits.CONFIRMED_LEAST or score > limits.EXPLAINED_CLEARLY
@@ -189,7 +194,7 @@ def equalize_samples(
 def _equalize(sample: Sample, sequence: PatternSequence, light: FrameLight) -> np.ndarray:
     """Return the levels (n, 3, p) of a sample under equal light."""
     row, column = sample.place.T
-    wave = light.wave @ np.stack(_waves(row, light))
+    wave = light.wave @ np.stack(evaluate_waves(row, light))
     gain = light.gain[:, None] * (1 + wave)
     room = light.uniform[:, None, None]
     if light.albedo.any():
@@ -198,12 +203,6 @@ def _equalize(sample: Sample, sequence: PatternSequence, light: FrameLight) -> n
         albedo = np.stack([estimate_albedo(sequence, each, light.changes) for each in seen])
         room = room + lamp[:, None] * albedo
     return ((sample.levels - room) / gain[:, None]).astype(np.float32)
-
-
-def _waves(row: np.ndarray, light: FrameLight) -> tuple[np.ndarray, np.ndarray]:
-    """Return cosine and sine of the light's wave at rows (p,), -0.5 to 0.5."""
-    angle = 2 * np.pi * light.cycles * (row + 0.5)
-    return np.cos(angle), np.sin(angle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +307,9 @@ class _Normal:
         """Indices of the frames that the sample shows."""
         return np.flatnonzero(self.level)
 
-    def solve(self, terms: Sequence[Term], change: int = 0) -> tuple[dict[str, np.ndarray], float]:
+    def solve(
+        self, terms: Sequence[Variation], change: int = 0
+    ) -> tuple[dict[str, np.ndarray], float]:
         """Return the change (n,) of each value, and the share of the residual that it removes.
 
         Beside the values of the terms, contrast and level of each period's steps, and the contrast
@@ -330,7 +331,7 @@ class _Normal:
             step[0] = np.where(sure, step[0] - same @ step[0], 0)
         return dict(zip(self.values, step, strict=True)), float(x @ moment) / max(self.entries, 1)
 
-    def rate_changes(self, terms: Sequence[Term]) -> dict[int, float]:
+    def rate_changes(self, terms: Sequence[Variation]) -> dict[int, float]:
         """Return the share of the residual that a change of the room's light removes, by the frame
         before which it happens: a few from either end, and inside a group of frames; between groups
         level and contrast of the fringes imitate it."""
@@ -350,7 +351,7 @@ class _Normal:
         return out
 
     def _reduce(
-        self, terms: Sequence[Term], changes: Sequence[int]
+        self, terms: Sequence[Variation], changes: Sequence[int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return what q unknowns do to the values (v n, q), their normal equations (q, q) and (q,)
         with what is known of them before, and the frame before which the room's light changes (q,),
@@ -366,6 +367,8 @@ class _Normal:
         if "gain" in terms:
             same = (self.groups[:, None] == self.groups).astype(float)
             blocks["gain"] = each - same / same.sum(axis=1, keepdims=True)
+        if "drift" in terms:
+            blocks["gain"] = (np.arange(n) / n - 0.5)[:, None]
         if "room" in terms:
             blocks |= dict.fromkeys(VALUES["room"], np.tri(n)[:, [*changes]])
         used = [(place, name) for place, name in enumerate(self.values) if name in blocks]
@@ -384,7 +387,9 @@ class _Normal:
         return t, normal, t.T @ self.moment, np.array(of_room)
 
 
-def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[Term]) -> _Normal:
+def _accumulate(
+    parts: Sequence[_Residual], light: FrameLight, terms: Sequence[Variation]
+) -> _Normal:
     """Return the normal equations of the terms, and of contrast and level, about a light."""
     n = len(light.gain)
     values = (*(name for term in terms for name in VALUES[term]), "contrast", "level")
@@ -393,7 +398,7 @@ def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[T
     squares, entries = 1e-12, 0
     for part in parts:
         f, root = part.frames, np.sqrt(part.weight)
-        waves = dict(zip(VALUES["wave"], _waves(part.row, light), strict=True))
+        waves = dict(zip(VALUES["wave"], evaluate_waves(part.row, light), strict=True))
         shapes = root * np.stack(
             [
                 part.shapes["gain"] * waves[name] if name in waves else part.shapes[name]
@@ -416,7 +421,7 @@ def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[T
     return _Normal(values, matrix, moment, loss, entries, groups, level, fuzzy)
 
 
-def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Term]:
+def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Variation]:
     """Return the terms of which one step promises to explain more of the residual than as many
     values of noise do, beside contrast and level."""
     light = FrameLight.constant(len(base.sequence.frames))
@@ -424,9 +429,10 @@ def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Term]:
     if not parts:
         return set()
     light = replace(light, cycles=_find_wave(parts))
-    normal = _accumulate(parts, light, tuple(VALUES))
+    normal = _accumulate(parts, light, ("gain", "wave", "room"))
     before, count = normal.solve(())[1], len(normal.known)
-    shares: dict[Term, float] = {
+    shares: dict[Variation, float] = {
+        "drift": normal.solve(("drift",))[1] - 1 / normal.entries,
         "gain": normal.solve(("gain",))[1] - count / normal.entries,
         "wave": normal.solve(("wave",))[1] - 2 * count / normal.entries,
         "room": max(normal.rate_changes(("room",)).values(), default=0.0),
@@ -447,11 +453,12 @@ def _find_wave(parts: Sequence[_Residual]) -> float:
 
 
 def _fit(
-    evaluator: Evaluator, base: Hypothesis, terms: tuple[Term, ...], start: FrameLight
+    evaluator: Evaluator, base: Hypothesis, terms: tuple[Variation, ...], start: FrameLight
 ) -> FrameLight:
     """Fit the terms of a model by Gauss-Newton steps from a first light, and return the light of
     the last step that leaves about the least residual: of few fringes in view they may diverge."""
-    light = best = replace(start, terms=terms)
+    fitted: tuple[Term, ...] = tuple("gain" if term == "drift" else term for term in terms)
+    light = best = replace(start, terms=fitted)
     least = np.inf
     for step in range(limits.MOST_STEPS):
         equal = equalize_samples(evaluator, base.sequence, light)
@@ -513,13 +520,19 @@ def _measure_losses(
     return np.concatenate(losses)
 
 
-def _is_large(sequence: PatternSequence, light: FrameLight, term: Term) -> bool:
-    """Return whether a term of the light is large enough to be corrected."""
+def _is_large(
+    sequence: PatternSequence, stack: np.ndarray, light: FrameLight, term: Variation
+) -> bool:
+    """Return whether a term of the light is large enough to be corrected, and a wave is in the
+    means of the rows."""
     if term == "wave":
-        return float(np.sqrt(np.mean(light.wave**2))) > limits.LEAST_WAVE
+        is_large = float(np.sqrt(np.mean(light.wave**2))) > limits.LEAST_WAVE
+        return is_large and shows_wave(sequence, stack, light)
     if term == "room":
         return float(np.ptp(light.room)) > limits.LEAST_ROOM
     logs = np.log(light.gain)
+    if term == "drift":
+        return float(np.ptp(logs)) > limits.REPORTED
     for steps in list_shifts(sequence):
         least = limits.LEAST_GAIN if len(steps) > 3 else limits.LEAST_GAIN_OF_THREE
         if logs[[*steps]].std() > least:
@@ -527,59 +540,3 @@ def _is_large(sequence: PatternSequence, light: FrameLight, term: Term) -> bool:
     coded = [i for i, f in enumerate(sequence.frames) if f.kind not in ("phase", "texture")]
     least_coded = limits.LEAST_CODED_GAIN[bool(list_shifts(sequence))]
     return bool(coded) and float(np.ptp(logs[coded])) / 2 > least_coded
-
-
-def _measure_unequal_means(
-    sequence: PatternSequence, stack: np.ndarray, light: FrameLight
-) -> tuple[float, float, float]:
-    """Measure the largest relative standard deviation of means of frames equal under equal light:
-    as captured, and without the light's gains and room light; and that of the gains, which room
-    light would have to balance where the means do not vary.
-
-    Equal are the steps of the finest period of an axis, and the sums of a bit and its inverse. A
-    surface that moves, and blur, imitate varying light, but not in these means.
-    """
-    means = stack[:, :: limits.MEAN_ROWS, :: limits.MEAN_COLUMNS].mean(axis=(1, 2))
-    # without the light of the room the mean is smaller, and the differences are the same
-    equalized = (means - light.room * means.mean()) / light.gain
-    spreads = []
-    for values, whole in ((means, means), (equalized, means), (light.gain, light.gain)):
-        spreads.append(
-            max(
-                (
-                    float(np.std(values[group].sum(axis=1)) / whole[group].sum(axis=1).mean())
-                    for group in _list_equal_sums(sequence)
-                ),
-                default=0.0,
-            )
-        )
-    return spreads[0], spreads[1], spreads[2]
-
-
-def _shows_wave(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> bool:
-    """Return whether the means of image rows vary among frames that are equal under equal light as
-    the light's wave does: gamma imitates a wave at the pixels, but not in the mean over fringes."""
-    rows = stack[:, :, :: limits.MEAN_COLUMNS].mean(axis=2)
-    waves = np.stack(_waves(np.linspace(-0.5, 0.5, rows.shape[1]), light))
-    products = np.zeros(3)
-    for group in _list_equal_sums(sequence):
-        first = sequence.frames[group[0, 0]]
-        if first.kind == "phase" and first.axis == "y":
-            continue  # the fringes are along the rows
-        sums = rows[group].sum(axis=1)
-        excess = sums / np.maximum(sums.mean(axis=0), 1e-6) - 1
-        seen = (excess - excess.mean(axis=1, keepdims=True)) @ waves.T * (2 / rows.shape[1])
-        own = light.wave[group].mean(axis=1)
-        own = own - own.mean(axis=0)
-        products += np.sum(seen * own), np.sum(seen**2), np.sum(own**2)
-    return bool(products[0] > 0.5 * np.sqrt(products[1] * products[2]))
-
-
-def _list_equal_sums(sequence: PatternSequence) -> Iterator[np.ndarray]:
-    """Yield groups (g, 1 or 2) of frames whose means, or sums of means, are equal."""
-    for axis in sequence.axes:
-        for _, steps in sequence.phase_shifts(axis)[-1:]:
-            yield np.array(steps)[:, None]
-        bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
-        if bits and len(bits) == len(inverse):
-            yield np.array([bits, inverse]).T

@@ -75,9 +75,11 @@ LEFT_OF_RIVAL, LEFT_LEAST = 2.0, 0.01
 preferred for accounting for all images."""
 STRANGE, STRANGE_LEAST = 3.0, 0.005
 """Residual of such a frame over the median of the others, and least squared contrast of it."""
-AS_LITTLE, AS_LITTLE_LEAST = 1.25, 0.002
-"""Share of the least misfit that the absence of a frame leaves, and misfit beyond it, up to which
-the absence of another frame explains as much."""
+SIGMAS_OF_RIVAL = 3.0
+"""Standard errors by which one frame that shows something else must explain all images better than
+another one."""
+AS_LITTLE = 1.25
+"""Share of the misfit of a hypothesis that a remedy with a rounded value may leave."""
 STRANGE_SHARE, VERY_STRANGE = 0.1, 0.15
 """Share of the misfit that its absence must remove, or squared contrast of its residual: the
 harmonics of a clipped cosine stay below both."""
@@ -157,6 +159,9 @@ FARTHEST_GAIN = 0.7
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
 """Rms of a wave along the rows, and change of the room's light over the mean grey level, that are
 corrected."""
+SEEN_OF_ROWS, SEEN_WAVE = 0.5, (0.5, 2.0)
+"""Share of the variation of the rows' means that a wave must explain, and their amplitude over the
+wave's: light that does not vary, and scattered light, lower it."""
 FEW_FRAMES_KNOWN = 3
 """Frames on either side of a change of the room's light: one or two may just be of other gain."""
 REFUTED, REFUTED_LEAST = 1.5, 0.004

@@ -43,11 +43,12 @@ it."""
 MIN_DECODED = 0.05
 """Share of the illuminated pixels that must decode: of sound captures, also cluttered ones, half
 and more do."""
+CONTRADICT = "contradict themselves or their neighbours"
 _FAULTS = {
     Reason.SATURATED: "are saturated: lower the exposure or the gain, and capture again",
     Reason.INCONSISTENT: (
-        "contradict themselves or their neighbours: keep the scene and the light still, raise the"
-        " exposure, and check the description of the frames"
+        f"{CONTRADICT}: keep the scene and the light still, raise the exposure, and check the"
+        " description of the frames"
     ),
     Reason.INDIRECT: (
         "receive much light from other surfaces or through the material: use the patterns micro,"
@@ -176,7 +177,8 @@ def check_capture(
 
     ``examination``: of these frames, made here if None. ``files``: names of the frames' files.
     """
-    raise_rejected(name, examination or examine_frames(sequence, frames, files))
+    examination = examination or examine_frames(sequence, frames, files)
+    raise_rejected(name, examination)
     for axis, phase in phases.items():
         illuminated, decoded = np.count_nonzero(phase.illuminated), np.count_nonzero(phase.mask)
         if decoded and decoded >= MIN_DECODED * illuminated:
@@ -184,6 +186,8 @@ def check_capture(
         if illuminated:
             reasons = phase.reason[phase.illuminated]
             share, fault = max((np.mean(reasons == each), fault) for each, fault in _FAULTS.items())
+            if fault.startswith(CONTRADICT) and examination.findings:
+                fault = "; ".join([CONTRADICT, *(f.text() for f in examination.findings)])
             raise InputError(
                 f"{name}: {decoded} of {illuminated} illuminated pixels"
                 f" ({100 * decoded / illuminated:.1f} %) give a coordinate along {axis};"

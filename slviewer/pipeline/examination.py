@@ -14,7 +14,7 @@ from slviewer.records.verdict import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
-VERSION = 7
+VERSION = 8
 """Of the examination; results of another version are computed anew."""
 _NUMBERED = re.compile(
     r"\b((?:frame|image)s? )(\d+(?:(?:, | and )\d+)*)\b(?! is missing)", re.IGNORECASE

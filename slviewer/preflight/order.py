@@ -1,4 +1,4 @@
-"""Is frame k of a capture pattern k? A burst of coded frames decides."""
+"""Is frame k of a capture pattern k?"""
 
 from dataclasses import replace
 from typing import Any
@@ -10,93 +10,62 @@ from slviewer.devices.protocols import BurstProjector, stated_full_scale
 from slviewer.errors import DeviceError
 from slviewer.examination.examine import examine
 from slviewer.fringe.presets import bits_for, gray_bits, phase_steps
-from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.fringe.sequence import Frame, Kind, PatternSequence
 from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
-from slviewer.records.verdict import ORDER_CAUSES
+from slviewer.records.verdict import ORDER_CAUSES, Examination
 
-_BEFORE, _AFTER = (1, 0, 0, 1, 0, 1), (0, 1, 1, 0)
+MISPLACING_CAUSES = (*ORDER_CAUSES, "ghosting")
 _STEPS = 12
 _PERIODS = 10  # across the projector
-_LAGS = (1, 2, 3)
+_REMEDY = (
+    "Switch the camera's buffering off, wait longer between showing and grabbing, check the cable"
+    " and the load of the computer, then check again."
+)
 
 
 def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
     """Check the order of the images, and whether images are delivered twice."""
-    projector = bench.rig.projector.size
-    levels = {1: Frame("white"), 0: Frame("black")}
-    frames = (
-        *(levels[on] for on in _BEFORE),
-        *phase_steps("x", _STEPS, max(4.0, projector[0] / _PERIODS)),
-        *(levels[on] for on in _AFTER),
-    )
-    full_scale = stated_full_scale(bench.rig.camera)
-    sequence = PatternSequence(projector, frames, full_scale=full_scale, relative=True)
+    projector, full_scale = bench.rig.projector.size, stated_full_scale(bench.rig.camera)
+    period_px = max(4.0, projector[0] / _PERIODS)
+    bits = range(bits_for(projector[0] / period_px))
+    kinds: tuple[Kind, ...] = ("gray", "inverse")
+    code = (Frame(kind, "x", bit=bit) for bit in bits for kind in kinds)
+    frames = (*phase_steps("x", _STEPS, period_px), *code)
+    sequence = PatternSequence(projector, frames, full_scale=full_scale)
     bench.show(None, "order of the frames")
     bench.wait()
     stack = capture_frames(
         replace(bench.rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep
     )
-    return _judge_order(bench, sequence, stack), check_repeats(sequence, stack)
+    order = judge_order(sequence, examine(sequence, stack))
+    if order.verdict != "good":
+        order = replace(order, remedy=_REMEDY)
+    return order, check_repeats(sequence, stack)
 
 
-def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -> Check:
-    """The check of the order of a captured stack (n, h, w): white and black frames, then fringe
-    residuals."""
-    n = len(stack)
-    levels = {
-        i: int(f.kind == "white")
-        for i, f in enumerate(sequence.frames)
-        if f.kind in ("white", "black")
-    }
-    shares = {
-        i: bench.share(
-            stack[i][:: bench.stride, :: bench.stride].astype(np.float32), bench.illuminated
-        )
-        for i in levels
-    }
-    errors = {i: abs(shares[i] - on) for i, on in levels.items()}
-    wrong = [i for i, error in errors.items() if error > 0.4]
-    mixed = [i for i, error in errors.items() if max(0.08, 5 * bench.unsteady) < error <= 0.4]
-    misplaced = [f for f in examine(sequence, stack).findings if f.cause in ORDER_CAUSES]
-    figures = {
+def judge_order(sequence: PatternSequence, examination: Examination) -> Check:
+    """Check that every frame shows the pattern of its place in the sequence."""
+    found = [f for f in examination.findings if f.cause in MISPLACING_CAUSES]
+    n = len(sequence.frames)
+    figures: dict[str, Any] = {
         "frames": n,
-        "light": [round(shares[i], 3) for i in sorted(shares)],
-        "misplaced_frames": sorted(
-            {*(i + 1 for i in wrong), *(i + 1 for f in misplaced for i in f.frames)}
-        ),
+        "misplaced_frames": sorted({i + 1 for f in found for i in f.frames}),
     }
-    if wrong and (lag := next((lag for lag in _LAGS if _is_lagging_by(shares, levels, lag)), 0)):
-        many = "one image" if lag == 1 else f"{lag} images"
-        sentence = f"Every frame is {many} late: frame k shows pattern k - {lag}."
-        remedy = "Switch the camera's buffering off, or wait longer between showing and grabbing."
-        return Check("order", "bad", sentence, remedy, figures | {"lag": lag})
-    verdict, sentence, remedy = _describe_order(n, wrong, mixed, [f.sentence for f in misplaced])
-    return Check("order", verdict, sentence, remedy, figures)
+    if not found:
+        return Check("order", "good", f"All {n} frames are in order.", "", figures)
+    if found[0].cause == "frame-lag" and found[0].value:
+        figures["lag"] = int(found[0].value)
+    findings = "; ".join(dict.fromkeys(f.sentence for f in found[:3]))
+    remedy = format_remedy(found[0].remedy)
+    is_rejected = any(f.severity == "rejected" for f in found)
+    verdict: CheckVerdict = "bad" if is_rejected else "warning"
+    return Check("order", verdict, f"Of {n} frames, {findings}.", remedy, figures)
 
 
-def _describe_order(
-    n: int, wrong: list[int], mixed: list[int], misplaced: list[str]
-) -> tuple[CheckVerdict, str, str]:
-    """Verdict, sentence and remedy for ``n`` frames that do not lag: indices of frames of a wrong
-    level of light, and of those that mix two; sentences on misplaced ones."""
-    if wrong or misplaced:
-        sentence = (
-            "; ".join(misplaced[:3]) or f"frame {wrong[0] + 1} shows the wrong level of light"
-        )
-        remedy = (
-            "Check the cable and the load of the computer, wait longer between showing and"
-            " grabbing, then check again."
-        )
-        return "bad", f"Of {n} coded frames, {sentence}.", remedy
-    if mixed:
-        sentence = f"Frame {mixed[0] + 1} of {n} still shows part of the pattern before it."
-        return (
-            "warning",
-            sentence,
-            "Wait longer between showing and grabbing, or lock the camera to the projector.",
-        )
-    return "good", f"All {n} coded frames came in order.", ""
+def format_remedy(text: str) -> str:
+    """Return a remedy, or another part of a message, as a sentence."""
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def check_burst(bench: RigUnderTest) -> Check:
@@ -120,8 +89,7 @@ def check_burst(bench: RigUnderTest) -> Check:
         burst = capture_frames(replace(rig, bursts=True), sequence)
     except DeviceError as error:
         what, _, remedy = str(error).rpartition(": ")
-        sentence, remedy = (f"{part[:1].upper()}{part[1:]}." for part in (what, remedy))
-        return Check("burst", "bad", sentence, remedy, figures)
+        return Check("burst", "bad", format_remedy(what), format_remedy(remedy), figures)
     bursts, singles = (
         stack[:, :: bench.stride, :: bench.stride][:, bench.illuminated].astype(np.float32)
         for stack in (burst, single)
@@ -138,13 +106,6 @@ def check_burst(bench: RigUnderTest) -> Check:
         f" {single_s:.2f} s."
     )
     return Check("burst", "good", sentence, "", figures)
-
-
-def _is_lagging_by(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:
-    """Whether every white or black frame shows the level of `lag` frames before, where that was one
-    too."""
-    pairs = [(shares[i], levels[i - lag]) for i in shares if i - lag in levels]
-    return all(abs(share - on) < 0.3 for share, on in pairs)
 
 
 def check_repeats(sequence: PatternSequence, stack: np.ndarray) -> Check:

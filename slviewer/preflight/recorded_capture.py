@@ -1,7 +1,7 @@
 """The checks of a rig on the frames of one recorded capture."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,17 +16,35 @@ from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.response import measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
-from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
+from slviewer.pipeline.check_results import Check, CheckName, CheckVerdict, Preflight
 from slviewer.pipeline.examination import examine_frames, name_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.preflight.light import MAX_NONLINEARITY
-from slviewer.preflight.order import check_repeats
-from slviewer.records.verdict import LIGHT_CAUSES, ORDER_CAUSES, Cause, Examination
+from slviewer.preflight.order import (
+    MISPLACING_CAUSES,
+    check_repeats,
+    format_remedy,
+    judge_order,
+)
+from slviewer.records.verdict import LIGHT_CAUSES, Cause, Examination
 from slviewer.session.capture import Capture
 
-_MISPLACING_CAUSES = (*ORDER_CAUSES, "ghosting")
-_CAUSES_ELSEWHERE = (*_MISPLACING_CAUSES, *LIGHT_CAUSES)
+_CAUSES_ELSEWHERE = (*MISPLACING_CAUSES, *LIGHT_CAUSES)
+_STEADINESS: dict[CheckName, tuple[tuple[Cause, ...], str, str]] = {
+    "flicker": (
+        ("exposure-drift", "flicker"),
+        "No frame is brighter or darker than the others.",
+        "Lock the camera's exposure, gain and white balance; make the exposure a multiple of 10 ms"
+        " (8.33 ms where the mains have 60 Hz).",
+    ),
+    "ambient": (
+        ("room-light",),
+        "The light of the room did not change between the frames.",
+        "Keep lamps, doors and daylight as they are while capturing.",
+    ),
+}
+"""By check: the causes that it reports, the sentence without them, and the remedy."""
 _FEW, _TOO_FEW = 0.75, 0.25
 """Shares of the illuminated pixels that must decode: below the first a warning, below the other
 most is lost."""
@@ -53,9 +71,8 @@ def _check_frames(capture: Capture, progress: Progress) -> Preflight:
     look = look_at(sequence, frames)
     examination = examine_frames(sequence, frames, capture.files, look)
     compared = (
-        _check_order(sequence, examination),
-        _check_light(examination),
-        _check_ambient_light(examination),
+        judge_order(sequence, examination),
+        *_check_steadiness(examination),
     )
     progress(0.6, "decoding")
     try:
@@ -93,50 +110,25 @@ def _check_description(
         verdict: CheckVerdict = "bad" if examination.rejected else "warning"
         remedy = "; ".join(dict.fromkeys(f.remedy for f in found))
         sentence = _join_findings([f.sentence for f in found])
-        return Check("description", verdict, sentence, _format_remedy(remedy), {})
+        return Check("description", verdict, sentence, format_remedy(remedy), {})
     if error:
         text, _, remedy = str(error).removeprefix(f"{name}: ").rpartition(": ")
-        return Check("description", "bad", _join_findings([text]), _format_remedy(remedy), {})
+        return Check("description", "bad", _join_findings([text]), format_remedy(remedy), {})
     return Check(
         "description", "good", "The frames agree with the description of the patterns.", "", {}
     )
 
 
-def _check_order(sequence: PatternSequence, examination: Examination) -> Check:
-    """Check that every frame shows the pattern of its place in the sequence."""
-    found = [f for f in examination.findings if f.cause in _MISPLACING_CAUSES]
-    n = len(sequence.frames)
-    misplaced = sorted({i + 1 for f in found for i in f.frames})
-    figures = {"frames": n, "misplaced_frames": misplaced}
-    if found:
-        findings = "; ".join(dict.fromkeys(f.sentence for f in found[:3]))
-        return Check(
-            "order", "bad", f"Of {n} frames, {findings}.", _format_remedy(found[0].remedy), figures
-        )
-    return Check("order", "good", f"All {n} frames are in order.", "", figures)
-
-
-def _check_light(examination: Examination) -> Check:
-    """Check that the projector's light and the exposure are constant over the frames."""
-    spread = examination.light_rms
-    figures = {"rms_from_frame_to_frame": round(spread, 5)}
-    if found := _list_sentences(examination, "exposure-drift", "flicker"):
-        remedy = (
-            "Lock the camera's exposure, gain and white balance; make the exposure a multiple of 10"
-            " ms (8.33 ms where the mains have 60 Hz)."
-        )
-        return Check("flicker", "warning", _join_findings(found[:3]), remedy, figures)
-    return Check("flicker", "good", "No frame is brighter or darker than the others.", "", figures)
-
-
-def _check_ambient_light(examination: Examination) -> Check:
-    """Check that the ambient light is constant over the frames."""
-    if found := _list_sentences(examination, "room-light"):
-        remedy = "Keep lamps, doors and daylight as they are while capturing."
-        return Check("ambient", "warning", _join_findings(found), remedy, {})
-    return Check(
-        "ambient", "good", "The light of the room did not change between the frames.", "", {}
-    )
+def _check_steadiness(examination: Examination) -> Iterator[Check]:
+    """Yield the checks that the light is constant over the frames: of projector and camera, and of
+    the room."""
+    figures = {"rms_from_frame_to_frame": round(examination.light_rms, 5)}
+    for name, (causes, good, remedy) in _STEADINESS.items():
+        known = figures if name == "flicker" else {}
+        if found := _list_sentences(examination, *causes):
+            yield Check(name, "warning", _join_findings(found[:3]), remedy, known)
+        else:
+            yield Check(name, "good", good, "", known)
 
 
 def _check_response(
@@ -254,12 +246,6 @@ def _list_sentences(examination: Examination, *causes: Cause) -> list[str]:
     return [f.sentence for f in examination.findings if f.cause in causes]
 
 
-def _format_remedy(text: str) -> str:
-    """Return a remedy as a sentence."""
-    return f"{text[:1].upper()}{text[1:]}."
-
-
 def _join_findings(findings: Sequence[str]) -> str:
     """Join findings, each once, to a sentence."""
-    text = "; ".join(dict.fromkeys(findings))
-    return f"{text[0].upper()}{text[1:]}."
+    return format_remedy("; ".join(dict.fromkeys(findings)))

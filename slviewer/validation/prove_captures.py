@@ -57,6 +57,7 @@ _REFUSALS = {
     r"which the projector spans": "fringe-period|projector-size",
     r"which a Gray cell spans": "gray-cell|fringe-period",
     r"Gray bits number": "fringe-period|gray-cell|projector-size",
+    r"response is nonlinear": "gamma",
     r"modulation is": "dark",
     r"rows and between the frames": "flicker",
     r"light of the room": "room-light",

@@ -138,7 +138,7 @@ def test_a_camera_that_is_behind_is_named(images, looked, lying):
     ("wrong", "names", "facts"),
     [
         ({"late": {9}}, {"order"}, ("frame 10", "frame 9")),
-        slow({"late": {3}}, {"order"}, ("frame 4", "level")),
+        slow({"late": {3}}, {"order"}, ("frame 4", "frame 3")),
         ({"repeated": {9}}, {"order", "repeats"}, ("frame 10", "frame 9")),
         slow({"dropped": 10}, {"order"}, ("frame 11", "missing")),
         ({"swapped": 8}, {"order"}, ("frames 9 and 10", "places")),
@@ -225,7 +225,7 @@ def test_what_moves_is_named(looked):
     here = world()
 
     def push(sentence: str) -> None:
-        if "coded frames" in sentence:
+        if "frames are in order" in sentence:
             pose = here.pose
             here.place("board", Pose(pose.R, pose.t + np.array([3.0, 0.0, 0.0])))
 
