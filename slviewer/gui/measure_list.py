@@ -36,7 +36,7 @@ from slviewer.inspection.section import (
 )
 from slviewer.pipeline.inspect_parts import FILES
 from slviewer.pipeline.measure import section_lines
-from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
+from slviewer.pipeline.operation import Stored, load_arrays, name_records
 from slviewer.records.inspection import RULE, Characteristic, CharacteristicResult, Inspection
 from slviewer.records.measurement import Measurement, list_quantities
 from slviewer.records.plain import from_plain, to_plain

@@ -36,7 +36,7 @@ from slviewer.gui.widgets import (
     table,
     to_html,
 )
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.operation import Stored
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.merge import Merge
 from slviewer.records.table import use_labels

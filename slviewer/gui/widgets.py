@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.io import wavfile
 
 from slviewer.errors import hide_passwords
-from slviewer.pipeline.stored_records import Stored, name_records
+from slviewer.pipeline.operation import Stored, name_records
 from slviewer.records.table import Mark, Table, relabel
 from slviewer.report.page import Figure
 from slviewer.server.help_pages import PREFIX

@@ -44,7 +44,6 @@ from slviewer.pipeline.capture_phases import (
     look_at_capture,
     match_second,
 )
-from slviewer.pipeline.feedback import Progress, part, stage
 from slviewer.pipeline.models import (
     MODELS,
     Model,
@@ -58,11 +57,20 @@ from slviewer.pipeline.models import (
     warn_if_frame_changed,
     warn_if_stale,
 )
-from slviewer.pipeline.operation import Found, Job, operation
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
+    Progress,
+    list_records,
+    load_record,
+    match_names,
+    operation,
+    part,
+    stage,
+)
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import check_capture_sizes, reconstruct_captures, segment_board
 from slviewer.pipeline.scale import record_scale, scale_factor
-from slviewer.pipeline.stored_records import list_records, load_record, match_names
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.camera_match import epipolar_lines
 from slviewer.records.acceptance import AcceptanceTest, Contribution, ErrorBudget, PositionErrors

@@ -32,7 +32,6 @@ from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.lens import Lens
 from slviewer.pipeline.capture_phases import capture_texture, convert_to_8bit, decode_or_explain
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import (
     MODELS,
     VERDICT,
@@ -46,9 +45,22 @@ from slviewer.pipeline.models import (
     trash_models,
     warn_if_frame_changed,
 )
-from slviewer.pipeline.operation import Found, Job, operation
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
+    Progress,
+    SessionLike,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
+    load_record,
+    match_names,
+    opened_or_made,
+    operation,
+    part,
+    stage,
+)
 from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
-from slviewer.pipeline.stored_records import SessionLike, load_record, match_names, opened_or_made
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Verdict

@@ -25,10 +25,15 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.examination import load_or_save_examination
 from slviewer.pipeline.exposure_check import warn_of_exposure
-from slviewer.pipeline.feedback import Warn, ignore_warnings, part
-from slviewer.pipeline.operation import Callbacks, takes_settings
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Warn,
+    ignore_warnings,
+    opened_or_made,
+    part,
+    takes_settings,
+)
 from slviewer.pipeline.rig_choice import Choice, RigLike, RigSetup, SetUp, load_rig, set_up
-from slviewer.pipeline.stored_records import opened_or_made
 from slviewer.pipeline.suggest_exposure import (
     BUDGET_S,
     MAX_SUGGESTED,

@@ -8,9 +8,8 @@ import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.fringe.phase import PhaseMap
-from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.models import Model, frame_of, load_stereo
-from slviewer.pipeline.operation import Found, plain_settings
+from slviewer.pipeline.operation import Found, Warn, plain_settings
 from slviewer.pipeline.scale import describe_calibration, scale_factor
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.reconstruction import DepthCheck, Reconstruction

@@ -16,7 +16,6 @@ from slviewer.inspection.deviation import (
     deviation_colours,
     judge_deviation,
 )
-from slviewer.pipeline.feedback import part, stage
 from slviewer.pipeline.measure import provenance
 from slviewer.pipeline.measured_surface import (
     LoadSurface,
@@ -25,8 +24,7 @@ from slviewer.pipeline.measured_surface import (
     triangulate_surface,
 )
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.stored_records import placed_file
+from slviewer.pipeline.operation import Found, Job, operation, part, placed_file, stage
 from slviewer.records.measurement import (
     LEAST_AREA,
     DeviationStatistics,

@@ -8,12 +8,20 @@ from datetime import UTC, datetime
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName, check_accepted
-from slviewer.pipeline.operation import Callbacks, Job, takes_settings
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Job,
+    Progress,
+    SessionLike,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
+    opened,
+    takes_settings,
+)
 from slviewer.pipeline.reconstruct import scan_cloud
 from slviewer.pipeline.scan_edits import OFF, parse_region
-from slviewer.pipeline.stored_records import SessionLike, opened
 from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest

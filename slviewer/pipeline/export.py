@@ -14,7 +14,6 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import rigid_transform
-from slviewer.pipeline.feedback import part
 from slviewer.pipeline.models import (
     ModelName,
     available_models,
@@ -25,12 +24,20 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.operation import Callbacks, Job, takes_settings
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Job,
+    SessionLike,
+    Stored,
+    list_records,
+    opened,
+    part,
+    takes_settings,
+)
 from slviewer.pipeline.reconstruct import merge_name, points_with_normals, read_merge, scan_cloud
 from slviewer.pipeline.report import report
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restriction_notes
-from slviewer.pipeline.stored_records import SessionLike, Stored, list_records, opened
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals

@@ -9,7 +9,7 @@ from slviewer.fringe.layout import white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.check_results import Check, CheckVerdict
-from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.operation import Warn
 
 CLIPPED, MUCH_CLIPPED = 0.005, 0.05
 """Shares of the illuminated pixels that are saturated: a warning, and bad."""

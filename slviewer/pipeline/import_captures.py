@@ -28,10 +28,16 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture, decode_examined, match_second
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.pipeline.exposure_check import warn_of_exposure
-from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import available_models, save_imported_stereo, trash_models
-from slviewer.pipeline.operation import Callbacks, takes_settings
-from slviewer.pipeline.stored_records import SessionLike, opened, opened_or_made
+from slviewer.pipeline.operation import (
+    Callbacks,
+    SessionLike,
+    Warn,
+    ignore_warnings,
+    opened,
+    opened_or_made,
+    takes_settings,
+)
 from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.capture import Capture, NewCapture, Role
 from slviewer.session.importers import opencv_calibration

@@ -28,18 +28,25 @@ from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import PointErrors
 from slviewer.pipeline.compare import fit_to_nominal
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.measure import load_feature
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, load_surface
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.operation import Findings, Found, Job, operation
-from slviewer.pipeline.stored_records import (
+from slviewer.pipeline.operation import (
+    Findings,
+    Found,
+    Job,
+    Progress,
     SessionLike,
     Stored,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
     list_records,
     match_names,
     next_name,
     opened,
+    operation,
+    part,
 )
 from slviewer.printable import format_csv
 from slviewer.records.inspection import (

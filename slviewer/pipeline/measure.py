@@ -16,7 +16,6 @@ from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane, section, triangulate_near
 from slviewer.inspection.uncertainty import Spread
-from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.measured_surface import (
     MERGED,
     LoadSurface,
@@ -29,14 +28,19 @@ from slviewer.pipeline.models import (
     ModelName,
     available_models,
 )
-from slviewer.pipeline.operation import OPERATIONS, Found, Job, operation
-from slviewer.pipeline.stored_records import (
+from slviewer.pipeline.operation import (
+    OPERATIONS,
+    Found,
+    Job,
     SessionLike,
     Stored,
+    Warn,
+    ignore_warnings,
     list_records,
     load_arrays,
     load_stored,
     opened,
+    operation,
 )
 from slviewer.printable import format_csv
 from slviewer.records.measurement import (

@@ -13,7 +13,6 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import NO_ERRORS
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import PointErrors, Spread, splined_shared
-from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     check_accepted,
     device_centres,
@@ -22,7 +21,7 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operation import Job, Warn, ignore_warnings
 from slviewer.pipeline.reconstruct import read_merge, scan_cloud
 from slviewer.pipeline.scale import load_scale_correction
 from slviewer.reconstruction.cloud import Cloud

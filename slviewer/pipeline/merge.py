@@ -20,13 +20,22 @@ from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.geometry.rigid import move_points, rotation_angle
 from slviewer.pipeline.cloud_record import list_outside_depths
-from slviewer.pipeline.feedback import Warn, ignore_warnings, part, stage
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
-from slviewer.pipeline.operation import Found, Job, operation
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
+    Warn,
+    ignore_warnings,
+    next_name,
+    operation,
+    part,
+    placed_file,
+    read_record,
+    stage,
+)
 from slviewer.pipeline.reconstruct import reconstruct_captures, scan_cloud
 from slviewer.pipeline.scale import describe_calibration
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
-from slviewer.pipeline.stored_records import next_name, placed_file, read_record
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.merge import (

@@ -12,11 +12,21 @@ import numpy as np
 from slviewer.errors import InputError, UsageError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.pipeline.export import check_export
-from slviewer.pipeline.feedback import part, stage
 from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
-from slviewer.pipeline.operation import Callbacks, Findings, Job, show_found, takes_settings
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Findings,
+    Job,
+    SessionLike,
+    load_record,
+    opened,
+    part,
+    show_found,
+    stage,
+    takes_settings,
+)
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import (
     merge_name,
@@ -25,7 +35,6 @@ from slviewer.pipeline.reconstruct import (
     scan_cloud,
 )
 from slviewer.pipeline.scan_edits import OFF, resolve_region, restriction_notes
-from slviewer.pipeline.stored_records import SessionLike, load_record, opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge
 from slviewer.session.capture import Capture

@@ -14,10 +14,10 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError, SessionError, SlviewerError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.operation import Found
-from slviewer.pipeline.stored_records import (
+from slviewer.pipeline.operation import (
+    Found,
     SessionLike,
+    Warn,
     load_record,
     opened,
     read_record,

@@ -17,7 +17,6 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.cloud_record import cloud_record, masked_share
-from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
     ModelName,
@@ -30,10 +29,19 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.operation import Found, Job, operation
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
+    Warn,
+    ignore_warnings,
+    is_up_to_date,
+    load_record,
+    numbered_names,
+    operation,
+    placed_file,
+)
 from slviewer.pipeline.scale import scale_cloud, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
-from slviewer.pipeline.stored_records import is_up_to_date, load_record, numbered_names, placed_file
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud, Misfit, choose_pixels, keep_pixels
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud, triangulate_grid

@@ -20,7 +20,6 @@ from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
-from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.measure import describe_measurement, section_lines
 from slviewer.pipeline.models import (
     available_models,
@@ -32,20 +31,23 @@ from slviewer.pipeline.models import (
     preferred_model,
     recommended_model,
 )
-from slviewer.pipeline.operation import Callbacks, takes_settings
-from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.scale import describe_scale
-from slviewer.pipeline.scan_edits import restrict_cloud
-from slviewer.pipeline.stored_records import (
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Progress,
     SessionLike,
     Stored,
+    ignore_progress,
     list_records,
     load_arrays,
     load_record,
     match_names,
     name_records,
     opened,
+    takes_settings,
 )
+from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.scale import describe_scale
+from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals
 from slviewer.records.acceptance import AcceptanceTest

@@ -31,8 +31,8 @@ from slviewer.devices.simulated_dlpc350 import simulated_lightcrafter_rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import check_imported_capture, find_captures
+from slviewer.pipeline.operation import ignore_warnings
 from slviewer.session.capture import Capture
 from slviewer.session.importers.imported import ImportableRecording
 from slviewer.session.layout import is_session

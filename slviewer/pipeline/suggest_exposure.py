@@ -18,7 +18,7 @@ from slviewer.fringe.limits import DARK_LEVELS
 from slviewer.fringe.plateau import find_plateau
 from slviewer.fringe.reference import dark_sigmas, phase_shift
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.operation import Progress, ignore_progress
 
 MAX_SUGGESTED = 4
 BUDGET_S = 20.0

@@ -24,13 +24,20 @@ from slviewer.pipeline.capture import (
     set_up_rig,
     warn_of_captured,
 )
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergeSettings, merge
 from slviewer.pipeline.mesh import MeshResult, mesh
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete
-from slviewer.pipeline.operation import Findings, takes_settings
+from slviewer.pipeline.operation import (
+    Findings,
+    Progress,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
+    opened_or_made,
+    part,
+    takes_settings,
+)
 from slviewer.pipeline.rig_choice import RigLike, RigSetup, load_rig
-from slviewer.pipeline.stored_records import opened_or_made
 from slviewer.records.merge import Merge
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.registration.refusal import Refused

@@ -19,7 +19,7 @@ from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_fr
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
 from slviewer.pipeline.examination import examine_frames, name_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.operation import Progress, ignore_progress
 from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import check_repeats
 from slviewer.records.verdict import LIGHT_CAUSES, ORDER_CAUSES, Cause, Examination

@@ -22,11 +22,10 @@ from slviewer.fringe.presets import multifrequency, p18
 from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.models import load_model, load_stereo
+from slviewer.pipeline.operation import Progress, ignore_progress, opened, part
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, simulate
-from slviewer.pipeline.stored_records import opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.records.plain import to_plain

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from slviewer.evaluation.render import Row, render
-from slviewer.pipeline.feedback import Progress, part
+from slviewer.pipeline.operation import Progress, part
 from slviewer.records.plain import to_plain
 
 T = TypeVar("T")

@@ -17,7 +17,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, part
+from slviewer.pipeline.operation import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.camera_match import epipolar_lines, match_cameras
 from slviewer.reconstruction.reconstruct import Model

@@ -17,10 +17,9 @@ from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.fit import Comparison
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
 from slviewer.pipeline.models import load_model, load_stereo
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operation import Job, Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at

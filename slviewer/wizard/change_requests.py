@@ -10,8 +10,7 @@ from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, step_histo
 from slviewer.pipeline.measure import rename_measurement, restore_measurement
 from slviewer.pipeline.merge import PLACEMENTS
 from slviewer.pipeline.models import available_models
-from slviewer.pipeline.operation import Findings, Job
-from slviewer.pipeline.stored_records import load_stored
+from slviewer.pipeline.operation import Findings, Job, load_stored
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Merge
 from slviewer.session.names import clean_label

@@ -19,9 +19,8 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import CalibrationRejected, DamagedError, InputError, SessionError
 from slviewer.pipeline.capture import Space, measure_space, warn_of_captured
 from slviewer.pipeline.examination import load_examination, load_or_save_examination
-from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.models import accepts_rejected
-from slviewer.pipeline.operation import Findings, Job, Operation
+from slviewer.pipeline.operation import Findings, Job, Operation, Warn
 from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages
 from slviewer.session.capture import Capture

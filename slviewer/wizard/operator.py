@@ -22,7 +22,6 @@ from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry import cuda_device
 from slviewer.pipeline.capture import check_space, depth_axis, save_frames
-from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.import_captures import (
     Role,
     describe_import,
@@ -30,7 +29,7 @@ from slviewer.pipeline.import_captures import (
     import_opencv_calibration,
 )
 from slviewer.pipeline.import_cloud import import_cloud
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operation import Job, Progress, part
 from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
 from slviewer.pipeline.turn import (
     FULL_TURN_DEG,

@@ -16,7 +16,6 @@ from slviewer.pipeline.accept import ValidateSettings, validate
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.compare import CompareSettings, compare
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
-from slviewer.pipeline.feedback import part
 from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
 from slviewer.pipeline.measure import (
     MeasureSettings,
@@ -43,10 +42,9 @@ from slviewer.pipeline.models import (
     available_models,
     check_accepted,
 )
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operation import Job, load_record, load_stored, part
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
-from slviewer.pipeline.stored_records import load_record, load_stored
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.measurement import MeasuredRegion, Measurement

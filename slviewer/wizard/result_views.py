@@ -24,10 +24,10 @@ from slviewer.pipeline.measured_surface import (
     surface_from_cloud,
 )
 from slviewer.pipeline.models import load_model, load_stereo
+from slviewer.pipeline.operation import is_up_to_date
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.scan_edits import restrict_cloud
-from slviewer.pipeline.stored_records import is_up_to_date
 from slviewer.reconstruction.cloud import Cloud, Misfit
 from slviewer.report.maps import PixelCurve
 from slviewer.session.capture import Capture

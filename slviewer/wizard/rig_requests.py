@@ -18,7 +18,7 @@ from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture import choose_sequence, depth_axis
 from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.pipeline.duplicate import duplicate_calibration
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.rig_choice import Choice, RigSetup, save_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, ExposureSuggestion, suggest_exposure
 from slviewer.preflight.check_rig import preflight

@@ -26,8 +26,8 @@ from slviewer.pipeline.models import (
     recommended_model,
     rejection_reason,
 )
+from slviewer.pipeline.operation import Stored, captures_of, load_record, load_stored
 from slviewer.pipeline.scale import describe_scale
-from slviewer.pipeline.stored_records import Stored, captures_of, load_record, load_stored
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement

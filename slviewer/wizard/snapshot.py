@@ -14,7 +14,7 @@ from slviewer.devices.browser import PageRole
 from slviewer.devices.world import Thing
 from slviewer.pipeline.capture import Space
 from slviewer.pipeline.check_results import Preflight
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.operation import Stored
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.records.calibration import PixelwiseFit, Reprojection, SplinedFit
 from slviewer.records.measurement import Measurement

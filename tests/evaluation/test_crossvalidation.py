@@ -20,7 +20,7 @@ from slviewer.pipeline.accept import (
     measure_held_out,
     split_folds,
 )
-from slviewer.pipeline.stored_records import read_record
+from slviewer.pipeline.operation import read_record
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.plain import to_plain
 from slviewer.records.table import render_text

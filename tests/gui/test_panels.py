@@ -39,7 +39,7 @@ from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html
 from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.calibrate import save_verdict
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.operation import Stored
 from slviewer.records.measurement import Measurement
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.plain import to_plain

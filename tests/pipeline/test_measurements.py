@@ -32,9 +32,9 @@ from slviewer.pipeline.measure import (
     trash_measurement,
 )
 from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.pipeline.operation import Stored, list_records, load_stored, opened, save_record
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.stored_records import Stored, list_records, load_stored, opened, save_record
 from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.merge import Merge
 from slviewer.records.plain import from_plain, to_plain

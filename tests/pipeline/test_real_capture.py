@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from slviewer.cli import main
-from slviewer.pipeline.stored_records import load_record
+from slviewer.pipeline.operation import load_record
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.session.store import Session
 

@@ -9,8 +9,8 @@ import pytest
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError
 from slviewer.pipeline.calibrate import CalibrateSettings
+from slviewer.pipeline.operation import Stored, load_record, load_stored, name_records
 from slviewer.pipeline.operations import OPERATIONS
-from slviewer.pipeline.stored_records import Stored, load_record, load_stored, name_records
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.drift import Drift
 from slviewer.records.inspection import Inspection

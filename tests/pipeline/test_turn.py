@@ -13,8 +13,8 @@ from facts import missing_facts, raises
 from faulty_rig import breakable
 
 from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError, UsageError
-from slviewer.pipeline.feedback import ignore_progress
 from slviewer.pipeline.merge import MergeSettings, merge
+from slviewer.pipeline.operation import ignore_progress
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.turn import (

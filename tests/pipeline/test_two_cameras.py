@@ -15,9 +15,9 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.capture_phases import decode_capture, match_second
 from slviewer.pipeline.models import load_calibration, load_pair
+from slviewer.pipeline.operation import load_record
 from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import set_up
-from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.camera_match import epipolar_lines
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.verification import Verification

@@ -12,7 +12,7 @@ from made_up import MODELS, planes, reproduction_data, session_data, spheres
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.pipeline.accept import gather_results
-from slviewer.pipeline.stored_records import read_record
+from slviewer.pipeline.operation import read_record
 from slviewer.records.acceptance import AcceptanceTest, Decision
 from slviewer.records.calibration import ModelCalibration, SplinedFit, VolumeSigma
 from slviewer.records.drift import Drift

@@ -24,7 +24,7 @@ from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measure import What
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
-from slviewer.pipeline.stored_records import Stored, load_arrays
+from slviewer.pipeline.operation import Stored, load_arrays
 from slviewer.records.measurement import Measurement
 from slviewer.report.canvas import round_up
 from slviewer.session.nominal import MM, Units

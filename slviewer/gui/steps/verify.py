@@ -18,7 +18,7 @@ from slviewer.gui.widgets import (
     colours,
     records_html,
 )
-from slviewer.pipeline.stored_records import Stored, load_arrays
+from slviewer.pipeline.operation import Stored, load_arrays
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
