@@ -41,8 +41,7 @@ from slviewer.records.inspection import RULE, Characteristic, CharacteristicResu
 from slviewer.records.measurement import Measurement, list_quantities
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.table import relabel
-from slviewer.report.canvas import finish_figure, new_figure, style_axes
-from slviewer.report.page import Figure
+from slviewer.report.page import Figure, finish_figure, new_figure, style_axes
 from slviewer.report.surfaces import draw_deviations, section_plot
 from slviewer.session.inspection_plan import OWN_PLAN
 from slviewer.wizard.result_requests import PLAN, TABLE

@@ -44,6 +44,7 @@ from slviewer.pipeline.capture_phases import (
     look_at_capture,
     match_second,
 )
+from slviewer.pipeline.cloud_corrections import record_scale, scale_factor
 from slviewer.pipeline.models import (
     MODELS,
     Model,
@@ -70,13 +71,19 @@ from slviewer.pipeline.operation import (
 )
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import check_capture_sizes, reconstruct_captures, segment_board
-from slviewer.pipeline.scale import record_scale, scale_factor
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.camera_match import epipolar_lines
-from slviewer.records.acceptance import AcceptanceTest, Contribution, ErrorBudget, PositionErrors
+from slviewer.records.acceptance import (
+    AcceptanceTest,
+    Contribution,
+    Drift,
+    ErrorBudget,
+    HeldOutError,
+    HeldOutPose,
+    ModelComparison,
+    PositionErrors,
+)
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.drift import Drift
-from slviewer.records.model_comparison import HeldOutError, HeldOutPose, ModelComparison
 from slviewer.session.reading import read_toml
 from slviewer.session.store import Session
 from slviewer.target.board import Board

@@ -23,8 +23,7 @@ from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.examination import load_or_save_examination
-from slviewer.pipeline.exposure_check import warn_of_exposure
+from slviewer.pipeline.examination import load_or_save_examination, warn_of_exposure
 from slviewer.pipeline.operation import (
     Callbacks,
     Warn,

@@ -22,6 +22,7 @@ import numpy as np
 from slviewer import __version__
 from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
+from slviewer.pipeline.cloud_corrections import load_scale_correction
 from slviewer.pipeline.models import available_models
 from slviewer.pipeline.operation import (
     Job,
@@ -34,7 +35,6 @@ from slviewer.pipeline.operation import (
     save_record,
 )
 from slviewer.pipeline.operations import OPERATIONS
-from slviewer.pipeline.scale import load_scale_correction
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.kinds import RECORDS
 from slviewer.records.record import Record

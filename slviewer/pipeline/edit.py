@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
+from slviewer.pipeline.cloud_corrections import OFF, parse_region
 from slviewer.pipeline.models import ModelName, check_accepted
 from slviewer.pipeline.operation import (
     Callbacks,
@@ -21,7 +22,6 @@ from slviewer.pipeline.operation import (
     takes_settings,
 )
 from slviewer.pipeline.reconstruct import scan_cloud
-from slviewer.pipeline.scan_edits import OFF, parse_region
 from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest

@@ -14,6 +14,12 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import rigid_transform
+from slviewer.pipeline.cloud_corrections import (
+    describe_scale,
+    resolve_region,
+    restriction_notes,
+    scale_factor,
+)
 from slviewer.pipeline.models import (
     ModelName,
     available_models,
@@ -36,8 +42,6 @@ from slviewer.pipeline.operation import (
 )
 from slviewer.pipeline.reconstruct import merge_name, points_with_normals, read_merge, scan_cloud
 from slviewer.pipeline.report import report
-from slviewer.pipeline.scale import describe_scale, scale_factor
-from slviewer.pipeline.scan_edits import resolve_region, restriction_notes
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals

@@ -26,8 +26,7 @@ from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture, decode_examined, match_second
-from slviewer.pipeline.examination import examine_frames, load_or_save_examination
-from slviewer.pipeline.exposure_check import warn_of_exposure
+from slviewer.pipeline.examination import examine_frames, load_or_save_examination, warn_of_exposure
 from slviewer.pipeline.models import available_models, save_imported_stereo, trash_models
 from slviewer.pipeline.operation import (
     Callbacks,

@@ -21,7 +21,7 @@ from slviewer.pipeline.operation import (
     save_record,
     takes_settings,
 )
-from slviewer.records.reconstruction import ImportedPoints, Reconstruction
+from slviewer.records.merge import ImportedPoints, Reconstruction
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers.clouds import ReadCloud, read_cloud, unit_warning
 from slviewer.session.nominal import Units

@@ -297,11 +297,8 @@ def process_capability(
     x = np.asarray(values, np.float64)
     n = len(x)
     low, high = -np.inf if lower is None else lower, np.inf if upper is None else upper
-    if (
-        n < MIN_PARTS
-        or not np.isfinite([low, high]).any()
-        or not (sigma := float(x.std(ddof=1))) > 0
-    ):
+    sigma = float(x.std(ddof=1)) if n >= MIN_PARTS else 0.0
+    if not (sigma > 0 and np.isfinite([low, high]).any()):
         return None
     mean, tail = float(x.mean()), (1 - CONFIDENCE) / 2
     cp = None

@@ -13,6 +13,7 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import NO_ERRORS
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import PointErrors, Spread, splined_shared
+from slviewer.pipeline.cloud_corrections import load_scale_correction
 from slviewer.pipeline.models import (
     check_accepted,
     device_centres,
@@ -23,7 +24,6 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.operation import Job, Warn, ignore_warnings
 from slviewer.pipeline.reconstruct import read_merge, scan_cloud
-from slviewer.pipeline.scale import load_scale_correction
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals, triangulate_grid
 from slviewer.reconstruction.rig_change import PointResponse

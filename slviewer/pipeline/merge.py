@@ -19,6 +19,12 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.geometry.rigid import move_points, rotation_angle
+from slviewer.pipeline.cloud_corrections import (
+    describe_calibration,
+    resolve_region,
+    restrict_cloud,
+    restriction_notes,
+)
 from slviewer.pipeline.cloud_record import list_outside_depths
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
 from slviewer.pipeline.operation import (
@@ -34,8 +40,6 @@ from slviewer.pipeline.operation import (
     stage,
 )
 from slviewer.pipeline.reconstruct import reconstruct_captures, scan_cloud
-from slviewer.pipeline.scale import describe_calibration
-from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.merge import (
@@ -528,13 +532,6 @@ def _align_scan(
             inputs=placed[onto].inputs | inputs,
         )
     return Placement(why=refusals[0], inputs=inputs)
-
-
-def remove_placement(store: Session, name: str) -> None:
-    """Move the placement of a scan to the trash: it is no longer shown with the others, and can be
-    aligned again."""
-    if store.has_result(f"{PLACEMENTS}/{name}"):
-        store.trash_result(f"{PLACEMENTS}/{name}")
 
 
 def list_placements(store: Session) -> dict[str, Placement | None]:

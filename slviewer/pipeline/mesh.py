@@ -11,6 +11,7 @@ import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.fringe.layout import to_eight_bits
+from slviewer.pipeline.cloud_corrections import OFF, resolve_region, restriction_notes
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
@@ -34,7 +35,6 @@ from slviewer.pipeline.reconstruct import (
     read_merge,
     scan_cloud,
 )
-from slviewer.pipeline.scan_edits import OFF, resolve_region, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge
 from slviewer.session.capture import Capture

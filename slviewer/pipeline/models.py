@@ -23,8 +23,8 @@ from slviewer.pipeline.operation import (
     read_record,
     save_record,
 )
+from slviewer.records.acceptance import ModelComparison
 from slviewer.records.calibration import ModelCalibration, Reprojection, SplinedFit, StereoFit
-from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
 from slviewer.session.reading import decoding

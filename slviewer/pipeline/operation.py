@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
-from slviewer.pipeline.scale import scale_factor
+from slviewer.pipeline.cloud_corrections import scale_factor
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain, to_plain

@@ -16,6 +16,13 @@ from slviewer.evaluation.fit import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
+from slviewer.pipeline.cloud_corrections import (
+    resolve_region,
+    restrict_cloud,
+    restriction_notes,
+    scale_cloud,
+    scale_factor,
+)
 from slviewer.pipeline.cloud_record import cloud_record, masked_share
 from slviewer.pipeline.models import (
     Model,
@@ -40,14 +47,11 @@ from slviewer.pipeline.operation import (
     operation,
     placed_file,
 )
-from slviewer.pipeline.scale import scale_cloud, scale_factor
-from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud, Misfit, choose_pixels, keep_pixels
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud, triangulate_grid
 from slviewer.reconstruction.relative_phase import resolve_phase
-from slviewer.records.merge import Merge
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Merge, Reconstruction
 from slviewer.records.table import render_text
 from slviewer.records.verification import Shape, Verification
 from slviewer.session.capture import Capture

@@ -20,6 +20,7 @@ from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
+from slviewer.pipeline.cloud_corrections import describe_scale, restrict_cloud
 from slviewer.pipeline.measure import describe_measurement, section_lines
 from slviewer.pipeline.models import (
     available_models,
@@ -46,18 +47,14 @@ from slviewer.pipeline.operation import (
     takes_settings,
 )
 from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.scale import describe_scale
-from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals
-from slviewer.records.acceptance import AcceptanceTest
+from slviewer.records.acceptance import AcceptanceTest, Drift
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.drift import Drift
 from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
-from slviewer.records.merge import Merge
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Merge, Reconstruction
 from slviewer.records.record import Record
 from slviewer.records.table import format_count
 from slviewer.records.verification import Verification

@@ -10,7 +10,7 @@ from slviewer.devices.capture import can_burst
 from slviewer.devices.protocols import Rig, report_driver_faults
 from slviewer.errors import DeviceError
 from slviewer.pipeline.capture import RigSettings, set_camera
-from slviewer.pipeline.check_results import Check, CheckName, Preflight
+from slviewer.pipeline.examination import Check, CheckName, Preflight
 from slviewer.pipeline.operation import (
     Progress,
     SessionLike,

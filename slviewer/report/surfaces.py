@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.records.measurement import NominalDeviation
-from slviewer.report.canvas import (
+from slviewer.report.page import (
     DENSITY,
     FULL,
     HALF,
     INK,
     SOFT,
     TEXT_PT,
+    Figure,
     add_colour_bar,
     add_legend,
     finish_figure,
@@ -26,7 +27,6 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.page import Figure
 from slviewer.surface.fuse import Fused
 
 LIGHT = np.array([-0.45, -0.36, -0.82]) / np.linalg.norm([-0.45, -0.36, -0.82])

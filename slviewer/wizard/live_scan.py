@@ -18,6 +18,7 @@ from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry import cuda_device
 from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.cloud_corrections import scale_factor
 from slviewer.pipeline.models import (
     accepts_rejected,
     check_accepted,
@@ -25,7 +26,6 @@ from slviewer.pipeline.models import (
     load_stereo,
     preferred_model,
 )
-from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.onepass import OnePass, PassResult
 from slviewer.reconstruction.onepass_cuda import has_pass, one_pass

@@ -16,6 +16,7 @@ from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
 from slviewer.inspection.regions import Region
+from slviewer.pipeline.cloud_corrections import restrict_cloud
 from slviewer.pipeline.measured_surface import (
     MERGED,
     MeasuredSurface,
@@ -27,7 +28,6 @@ from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.operation import is_up_to_date
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
-from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.reconstruction.cloud import Cloud, Misfit
 from slviewer.report.maps import PixelCurve
 from slviewer.session.capture import Capture

@@ -16,8 +16,8 @@ from slviewer.errors import DamagedError, DeviceError, InputError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture import choose_sequence, depth_axis
-from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.pipeline.duplicate import duplicate_calibration
+from slviewer.pipeline.examination import CheckVerdict, Preflight
 from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.rig_choice import Choice, RigSetup, save_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, ExposureSuggestion, suggest_exposure

@@ -14,6 +14,7 @@ from slviewer.errors import DamagedError, SessionError
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
+from slviewer.pipeline.cloud_corrections import describe_scale
 from slviewer.pipeline.models import (
     accepts_rejected,
     available_models,
@@ -27,12 +28,10 @@ from slviewer.pipeline.models import (
     rejection_reason,
 )
 from slviewer.pipeline.operation import Stored, captures_of, load_record, load_stored
-from slviewer.pipeline.scale import describe_scale
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
-from slviewer.records.merge import Placement
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Placement, Reconstruction
 from slviewer.session.capture import Capture, Role, read_capture
 from slviewer.session.inspection_plan import list_plans
 from slviewer.session.names import join_names

@@ -21,7 +21,7 @@ from slviewer.pipeline.accept import (
     split_folds,
 )
 from slviewer.pipeline.operation import read_record
-from slviewer.records.model_comparison import HeldOutPose, ModelComparison
+from slviewer.records.acceptance import HeldOutPose, ModelComparison
 from slviewer.records.plain import to_plain
 from slviewer.records.table import render_text
 from slviewer.target.board import Board

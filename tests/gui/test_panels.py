@@ -40,10 +40,10 @@ from slviewer.gui.widgets import colour_range, records_html
 from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.calibrate import save_verdict
 from slviewer.pipeline.operation import Stored
+from slviewer.records.acceptance import HeldOutPose, ModelComparison
 from slviewer.records.measurement import Measurement
-from slviewer.records.model_comparison import HeldOutPose, ModelComparison
+from slviewer.records.merge import Reconstruction
 from slviewer.records.plain import to_plain
-from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Shape, Verification
 from slviewer.server.secure import Serving

@@ -18,7 +18,7 @@ from slviewer.pipeline.operation import Job, load_record
 from slviewer.pipeline.reconstruct import scan_cloud
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.records.reconstruction import DepthCheck, Reconstruction
+from slviewer.records.merge import DepthCheck, Reconstruction
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import FLAT, BoardScene, Pose

@@ -10,7 +10,7 @@ import trimesh
 
 from slviewer.cli import main
 from slviewer.pipeline.operation import load_record
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Reconstruction
 from slviewer.session.store import Session
 
 pytestmark = [pytest.mark.computes, pytest.mark.slow]  # two calibrations from large photographs

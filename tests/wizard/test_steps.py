@@ -10,7 +10,7 @@ from slviewer.calibration.next_pose import Coverage, nominal_lens
 from slviewer.calibration.stereo import MIN_POSES, StereoModel
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture import Space
-from slviewer.records.reconstruction import DepthCheck, Reconstruction
+from slviewer.records.merge import DepthCheck, Reconstruction
 from slviewer.target.board import Board
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 from slviewer.wizard.snapshot import (

@@ -28,11 +28,10 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.pipeline.report import calibration_view
-from slviewer.records.model_comparison import ModelComparison
+from slviewer.records.acceptance import ModelComparison
 from slviewer.records.verdict import Cause, Finding, Verdict
-from slviewer.report.maps import PixelCurve, pixel_curves, rms_maps
+from slviewer.report.maps import PixelCurve, pixel_curves, pose_bars, residual_arrows, rms_maps
 from slviewer.report.page import Figure
-from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.report.session import CalibrationFigures, lens_table, rig_table
 from slviewer.target.board import Board
 from slviewer.wizard import result_views

@@ -39,7 +39,7 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
-from slviewer.records.reconstruction import REPORTED_OUTSIDE
+from slviewer.records.merge import REPORTED_OUTSIDE
 from slviewer.records.verification import Verification
 from slviewer.simulation.concave import CONCAVE
 from slviewer.wizard.result_views import (
