@@ -39,8 +39,7 @@ from slviewer.pipeline.measure import section_lines
 from slviewer.pipeline.operation import Stored, load_arrays, name_records
 from slviewer.records.inspection import RULE, Characteristic, CharacteristicResult, Inspection
 from slviewer.records.measurement import Measurement, list_quantities
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import relabel
+from slviewer.records.record import from_plain, relabel, to_plain
 from slviewer.report.page import Figure, finish_figure, new_figure, style_axes
 from slviewer.report.surfaces import draw_deviations, section_plot
 from slviewer.session.inspection_plan import OWN_PLAN

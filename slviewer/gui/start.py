@@ -18,7 +18,7 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.session.recent import MOST_RECENT, new_session_folder, sessions_folder
-from slviewer.wizard.session_overview import SessionOverview, read_overview
+from slviewer.wizard.session_reader import SessionOverview, read_overview
 
 START = "start"
 _PICTURE_PX = 96

@@ -21,7 +21,7 @@ from scipy.io import wavfile
 
 from slviewer.errors import hide_passwords
 from slviewer.pipeline.operation import Stored, name_records
-from slviewer.records.table import Mark, Table, relabel
+from slviewer.records.record import Mark, Table, relabel
 from slviewer.report.page import Figure
 from slviewer.server.help_pages import PREFIX
 from slviewer.server.text import escape

@@ -62,7 +62,7 @@ from slviewer.pipeline.operation import (
 )
 from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
 from slviewer.session.exporters import write_calibration

@@ -39,7 +39,7 @@ from slviewer.pipeline.suggest_exposure import (
     apply_suggestion,
     suggest_exposure,
 )
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.session.atomic import format_bytes
 from slviewer.session.capture import Capture, NewCapture, Purpose, Role, TurnStep
 from slviewer.session.names import new_name

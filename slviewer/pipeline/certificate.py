@@ -37,8 +37,7 @@ from slviewer.pipeline.operation import (
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.kinds import RECORDS
-from slviewer.records.record import Record
-from slviewer.records.table import Column, Rows, Table, format_count
+from slviewer.records.record import Column, Record, Rows, Table, format_count
 from slviewer.report.page import CERTIFICATE, Section, page_digest, split_page
 from slviewer.session.atomic import to_json
 from slviewer.session.capture import Capture

@@ -12,7 +12,7 @@ import numpy as np
 from slviewer.errors import InputError, UsageError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import AcceptanceTest
-from slviewer.records.plain import from_plain
+from slviewer.records.record import from_plain
 from slviewer.session.reading import expand_user, read_toml
 from slviewer.session.scan_edits import load_edits, load_region
 from slviewer.session.store import Session

@@ -15,7 +15,7 @@ from slviewer.fringe.layout import white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.operation import Warn
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session

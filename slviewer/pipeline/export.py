@@ -47,7 +47,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.kinds import RECORDS
 from slviewer.records.merge import Merge
-from slviewer.records.table import Value
+from slviewer.records.record import Value
 from slviewer.session.atomic import arriving_file, format_bytes, replace_file
 from slviewer.session.exporters import write_calibration
 from slviewer.session.mesh_files import (

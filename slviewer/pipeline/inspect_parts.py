@@ -57,7 +57,7 @@ from slviewer.records.inspection import (
     PartResult,
 )
 from slviewer.records.measurement import Measurement, Quantity
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.report.session import write_parts_page
 from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.inspection_plan import (

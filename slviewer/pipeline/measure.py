@@ -50,8 +50,7 @@ from slviewer.records.measurement import (
     Quantity,
     SectionPlane,
 )
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.record import to_vector
+from slviewer.records.record import from_plain, to_plain, to_vector
 from slviewer.session.atomic import replace_file
 from slviewer.session.names import clean_label
 from slviewer.session.store import Session

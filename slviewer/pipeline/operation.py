@@ -22,9 +22,7 @@ from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
 from slviewer.pipeline.cloud_corrections import scale_factor
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.record import Record
-from slviewer.records.table import render_text
+from slviewer.records.record import Record, from_plain, render_text, to_plain
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 

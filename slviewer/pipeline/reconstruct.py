@@ -52,7 +52,7 @@ from slviewer.reconstruction.cloud import Cloud, Misfit, choose_pixels, keep_pix
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud, triangulate_grid
 from slviewer.reconstruction.relative_phase import resolve_phase
 from slviewer.records.merge import Merge, Reconstruction
-from slviewer.records.table import render_text
+from slviewer.records.record import render_text
 from slviewer.records.verification import Shape, Verification
 from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply, write_ply

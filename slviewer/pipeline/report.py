@@ -55,8 +55,7 @@ from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Merge, Reconstruction
-from slviewer.records.record import Record
-from slviewer.records.table import format_count
+from slviewer.records.record import Record, format_count
 from slviewer.records.verification import Verification
 from slviewer.report.maps import PixelCurve, verification_maps
 from slviewer.report.page import Figure, write_page

@@ -7,8 +7,18 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
-from slviewer.records.record import Count, Record, Vector, list_shares
-from slviewer.records.table import Cell, Column, Mark, Table, format_scale, format_signed
+from slviewer.records.record import (
+    Cell,
+    Column,
+    Count,
+    Mark,
+    Record,
+    Table,
+    Vector,
+    format_scale,
+    format_signed,
+    list_shares,
+)
 
 Decision = Literal["pass", "fail", "undecided"]
 Interval = tuple[float, float]

@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from slviewer.records.record import Count, Record, Share
-from slviewer.records.table import Column, Table
+from slviewer.records.record import Column, Count, Record, Share, Table
 from slviewer.records.verdict import Finding, Verdict
 
 MIN_WEIGHT = 0.7

@@ -8,8 +8,7 @@ from typing import ClassVar
 import msgspec
 
 from slviewer.records.acceptance import MARKS, Decision, worst_decision
-from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Row, Table, format_count
+from slviewer.records.record import Cell, Column, Count, Record, Row, Table, format_count
 
 RULE = (
     "Decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty"

@@ -10,9 +10,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.records.acceptance import COVERAGE, MARKS, Decision
-from slviewer.records.plain import from_plain
-from slviewer.records.record import Count, Matrix4, Record, Vector
-from slviewer.records.table import Cell, Column, Table
+from slviewer.records.record import Cell, Column, Count, Matrix4, Record, Table, Vector, from_plain
 
 Unit = Literal["mm", "deg", "mm²", "%", ""]
 

@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
-from slviewer.records.record import Count, Matrix4, Record, Share, Vector
-from slviewer.records.table import Cell, Column, Table
+from slviewer.records.record import Cell, Column, Count, Matrix4, Record, Share, Table, Vector
 
 REPORTED_RAISE = 1.2
 """Times its predicted noise that a calibration's residual is, from which raising sigma is

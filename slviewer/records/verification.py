@@ -10,9 +10,19 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
-from slviewer.records.plain import to_plain
-from slviewer.records.record import Count, Record, Vector, list_numbers, list_shares
-from slviewer.records.table import Cell, Column, Table, compare_with_first, format_scale
+from slviewer.records.record import (
+    Cell,
+    Column,
+    Count,
+    Record,
+    Table,
+    Vector,
+    compare_with_first,
+    format_scale,
+    list_numbers,
+    list_shares,
+    to_plain,
+)
 
 Shape = Literal["plane", "sphere"]
 MAX_EXCLUDED = 0.02

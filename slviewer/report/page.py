@@ -1,6 +1,6 @@
 """One HTML file that holds everything it shows: text, tables, and figures as embedded images,
-without script or network; and what all figures share: a canvas without global state, the palette, the
-styles of axes.
+without script or network; and what all figures share: a canvas without global state, the palette,
+the styles of axes.
 
 matplotlib is used through its objects alone (no pyplot, no rcParams), so that reports may be
 written by any thread."""
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from slviewer import __version__
 from slviewer.printable import escape_controls
-from slviewer.records.table import Mark, Table
+from slviewer.records.record import Mark, Table
 from slviewer.session.atomic import replace_file
 
 CERTIFICATE = '<template id="certificate">', "</template>"

@@ -11,7 +11,7 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation import letter
 from slviewer.records.merge import Merge
-from slviewer.records.table import (
+from slviewer.records.record import (
     Cell,
     Column,
     Rows,

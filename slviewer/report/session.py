@@ -25,8 +25,7 @@ from slviewer.records.calibration import ModelCalibration, Reprojection
 from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Merge, Reconstruction
-from slviewer.records.record import Record
-from slviewer.records.table import Cell, Column, Mark, Table, Value, format_count, relabel
+from slviewer.records.record import Cell, Column, Mark, Record, Table, Value, format_count, relabel
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, average
 from slviewer.report.maps import coverage, pose_bars, residual_arrows, rms_maps

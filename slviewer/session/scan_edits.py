@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest

@@ -28,7 +28,7 @@ from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, simulate
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.onepass import OnePass
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.session import atomic
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session

@@ -24,8 +24,7 @@ from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
-from slviewer.records.plain import to_plain
-from slviewer.records.table import Column, Row, Table, render_text
+from slviewer.records.record import Column, Row, Table, render_text, to_plain
 from slviewer.records.verification import Shape, Verification, average, centre_distances_mm
 from slviewer.report.page import write_page
 from slviewer.report.reproduction import (

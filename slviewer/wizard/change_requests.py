@@ -18,17 +18,18 @@ from slviewer.session.scan_edits import load_edits, load_region, save_region
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import Edit, select_support
-from slviewer.wizard.engine import Engine, request
-from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
-from slviewer.wizard.undo_history import (
+from slviewer.wizard.engine import (
+    Engine,
     Step,
     combine,
     decide_step,
     edit_step,
     move_step,
+    request,
     restore_step,
     trash_step,
 )
+from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
 
 _RESULTS_OF_CAPTURE = ("poses", "clouds", "verify", "trust", PLACEMENTS)
 

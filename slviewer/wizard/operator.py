@@ -48,13 +48,12 @@ from slviewer.session.importers.archive import CLOUD_SUFFIXES, unpack, unpacked_
 from slviewer.session.importers.clouds import FORMATS
 from slviewer.session.names import new_name, plain_name
 from slviewer.session.reading import expand_user
-from slviewer.wizard.engine import request
+from slviewer.wizard.engine import combine, decide_step, exchange_step, request
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.result_requests import ResultRequests
 from slviewer.wizard.rig_requests import RigRequests
 from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import PreviewView, Snapshot
-from slviewer.wizard.undo_history import combine, decide_step, exchange_step
 
 IMPORTING = "Importing"
 BOARD_S = 10.0

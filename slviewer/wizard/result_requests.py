@@ -48,8 +48,7 @@ from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, r
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.measurement import MeasuredRegion, Measurement
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import format_count
+from slviewer.records.record import format_count, from_plain, to_plain
 from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
@@ -61,7 +60,7 @@ from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard.change_requests import ChangeRequests
 from slviewer.wizard.diagnostics import write_bundle
 from slviewer.wizard.engine import on_session, request
-from slviewer.wizard.notices import describe_failure
+from slviewer.wizard.jobs import describe_failure
 from slviewer.wizard.result_views import surface_to_measure
 from slviewer.wizard.session_reader import missing_for_splined
 

@@ -22,7 +22,7 @@ from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.rig_choice import Choice, RigSetup, save_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, ExposureSuggestion, suggest_exposure
 from slviewer.preflight.check_rig import preflight
-from slviewer.records.table import format_count
+from slviewer.records.record import format_count
 from slviewer.session.reading import expand_user
 from slviewer.session.recent import unused_folder
 from slviewer.session.store import Session

@@ -1,8 +1,12 @@
-"""Reads what a session's files contain, for the panels. Descriptions of captures and results that
-did not change are not read again (`session.reading.identify`); features of poses are kept."""
+"""Reads what a session's files contain, for the panels, and what a list of sessions shows of each.
+Descriptions of captures and results that did not change are not read again
+(`session.reading.identify`); features of poses are kept."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -10,7 +14,7 @@ import numpy as np
 from slviewer.calibration.next_pose import outline_px
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
-from slviewer.errors import DamagedError, SessionError
+from slviewer.errors import DamagedError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
@@ -32,6 +36,8 @@ from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Placement, Reconstruction
+from slviewer.records.record import format_count, format_counts
+from slviewer.records.verdict import Level
 from slviewer.session.capture import Capture, Role, read_capture
 from slviewer.session.inspection_plan import list_plans
 from slviewer.session.names import join_names
@@ -39,8 +45,9 @@ from slviewer.session.nominal import NOMINALS
 from slviewer.session.scan_edits import list_edits, load_region
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.wizard.notices import describe_failure
+from slviewer.wizard.jobs import describe_failure
 from slviewer.wizard.pose_plan import PlanInput, Planner, PoseFeatures, PosePlan
+from slviewer.wizard.result_views import make_thumbnail
 from slviewer.wizard.snapshot import (
     CalibrationView,
     ExportView,
@@ -416,3 +423,50 @@ def missing_for_splined(session: Session) -> str:
         f"{needed}, and only {both} of {len(poses)} have them: choose patterns of both axes, and"
         " capture more"
     )
+
+
+@dataclass(frozen=True)
+class SessionOverview:
+    """A session: when it was changed last, what it `holds` in words, the verdict on its
+    calibration, None where there is none, and a JPEG of its first scan, else pose.
+
+    `fault`: why it cannot be read, empty where it can.
+    """
+
+    folder: Path
+    changed: datetime
+    holds: str = ""
+    is_calibrated: bool = False
+    verdict: Level | None = None
+    thumbnail: bytes = b""
+    fault: str = ""
+
+
+def read_overview(folder: Path) -> SessionOverview:
+    """Read what a list shows of a session; a damaged one has a fault."""
+    parts = [folder / name for name in ("session.json", "decisions.json", "captures", "results")]
+    times = [part.stat().st_mtime for part in parts if part.exists()]
+    changed = datetime.fromtimestamp(max(times, default=0.0)).astimezone()
+    try:
+        with Session.open(folder) as session:
+            return _read(session, changed)
+    except SlviewerError as error:
+        return SessionOverview(folder, changed, fault=str(error))
+
+
+def _read(session: Session, changed: datetime) -> SessionOverview:
+    """Read the overview of an open session."""
+    captures = session.captures()
+    holds = format_counts(each.purpose for each in captures)
+    if n := sum(name.startswith(f"{Measurement.kind}/") for name in session.result_names()):
+        holds += f", {format_count(n, 'measurement')}"
+    verdict, is_calibrated = None, "stereo" in available_models(session)
+    with suppress(SlviewerError):
+        verdict = load_last_verdict(session)
+    picture = b""
+    for capture in sorted(captures, key=lambda each: each.purpose == "scan", reverse=True):
+        with suppress(SlviewerError):
+            picture = make_thumbnail(capture)
+            break
+    level = verdict.level if verdict else None
+    return SessionOverview(session.folder, changed, holds, is_calibrated, level, picture)

@@ -22,8 +22,7 @@ from slviewer.pipeline.accept import (
 )
 from slviewer.pipeline.operation import read_record
 from slviewer.records.acceptance import HeldOutPose, ModelComparison
-from slviewer.records.plain import to_plain
-from slviewer.records.table import render_text
+from slviewer.records.record import render_text, to_plain
 from slviewer.target.board import Board
 
 SIZE, PERIOD = (200, 150), 18.0

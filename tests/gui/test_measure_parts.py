@@ -24,7 +24,7 @@ from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.pipeline.operation import Stored
 from slviewer.records.measurement import DECIDED, Measurement, Quantity
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.report.surfaces import section_plot
 from slviewer.wizard.result_views import place_at
 

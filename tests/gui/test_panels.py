@@ -43,7 +43,7 @@ from slviewer.pipeline.operation import Stored
 from slviewer.records.acceptance import HeldOutPose, ModelComparison
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Reconstruction
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Shape, Verification
 from slviewer.server.secure import Serving

@@ -37,7 +37,7 @@ from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.merge import Merge
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset

@@ -17,7 +17,7 @@ from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.merge import Merge, Placement, Reconstruction
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, centre_distances_mm
 from slviewer.session.store import Session

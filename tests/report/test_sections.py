@@ -27,7 +27,7 @@ from slviewer.records.inspection import (
     Inspection,
     PartResult,
 )
-from slviewer.records.table import Cell, Table, better_worse, compare_errors
+from slviewer.records.record import Cell, Table, better_worse, compare_errors
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Verification
 from slviewer.report.page import Figure, PageNotice, Section, write_page
