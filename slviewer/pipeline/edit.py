@@ -138,8 +138,7 @@ def edit_scan(settings: EditSettings) -> ScanEdits:
             store.load_capture(scan)
         else:
             check_accepted(store, settings.accept_rejected)
-            job, plane = Job(store, settings.progress, settings.warn), None
-            cloud = scan_cloud(job, scan, settings.model, settings.accept_rejected)
+            cloud, plane = scan_cloud(settings.job(store), scan, settings.model), None
             if cloud.normals is not None:
                 raise InputError(
                     f"{scan} was imported as a cloud, whose points are not those of pixels: cut it"
@@ -266,7 +265,8 @@ def set_region(
         region = load_region(store, even_if_off=True)
         if around:
             check_accepted(store, accept_rejected)
-            cloud = scan_cloud(Job(store, progress, warn), around, model, accept_rejected, OFF)
+            job = Job(store, progress, warn, accept_rejected)
+            cloud = scan_cloud(job, around, model, OFF)
             region = RegionOfInterest.around(cloud.points)
         elif roi not in ("", OFF, "on"):
             region = parse_region(roi)

@@ -32,7 +32,6 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.operation import (
     Callbacks,
-    Job,
     SessionLike,
     Stored,
     list_records,
@@ -496,8 +495,8 @@ def _write_shape(store: Session, name: str, target: Path, settings: ExportSettin
     progress, is_scan = settings.progress, settings.what in _SCANS
     source: Cloud | PointSet
     if is_scan:
-        job = Job(store, part(progress, 0, 0.4), settings.warn)
-        cloud = scan_cloud(job, name, settings.model, settings.accept_rejected, settings.roi)
+        job = settings.job(store).part(0, 0.4)
+        cloud = scan_cloud(job, name, settings.model, settings.roi)
         if not (mask := cloud.mask).any():
             raise InputError(
                 f"{name}: no pixel was measured: does the calibration belong to this camera and"

@@ -159,8 +159,8 @@ def _load_part(
 ) -> MeasuredSurface:
     """Load the surface of a part."""
     with opened(session) as store:
-        job, accepts = Job(store, progress, warn), settings.accept_rejected
-        return load_surface(job, scan, settings.model, accept_rejected=accepts)
+        job = Job(store, progress, warn, settings.accept_rejected)
+        return load_surface(job, scan, settings.model)
 
 
 def inspect_surfaces(

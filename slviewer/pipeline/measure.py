@@ -154,9 +154,7 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
     """Measure on a scan: a distance between points, a section, a shape fitted to a region; the
     session stores it."""
     store = job.store
-    on = load_surface(
-        job, settings.scan, settings.model, settings.roi, settings.accept_rejected, settings.load
-    )
+    on = load_surface(job, settings.scan, settings.model, settings.roi, settings.load)
     makers = {"point": _pick, "distance": _measure_distance, "section": _cut}
     fields, arrays = makers.get(settings.what, _fit)(on, settings)
     fields["warnings"] = (*on.errors.warnings, *fields.get("warnings", ()))

@@ -15,12 +15,11 @@ from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import PointErrors, Spread, splined_shared
 from slviewer.pipeline.cloud_corrections import load_scale_correction
 from slviewer.pipeline.models import (
-    check_accepted,
+    check_calibration,
     device_centres,
     load_model,
     load_stereo,
     preferred_model,
-    warn_if_stale,
 )
 from slviewer.pipeline.operation import Job, Warn, ignore_warnings
 from slviewer.pipeline.reconstruct import read_merge, scan_cloud
@@ -133,22 +132,20 @@ def load_surface(
     scan: str,
     model: str | None = None,
     roi: str = "",
-    accept_rejected: bool = False,
     load: LoadSurface | None = None,
 ) -> MeasuredSurface:
     """Reconstruct a capture to measure on it, or read a stored merge, named ``merge/<number>``;
     ``roi`` as in `resolve_region`, for captures alone. ``load`` returns a surface that is at
     hand."""
-    store, warn = job.store, job.warn
+    store = job.store
     if load is not None:
         return load(store)
     if scan.startswith(MERGED):
-        return load_merged_surface(store, scan, warn, roi)
+        return load_merged_surface(store, scan, job.warn, roi)
     if not store.load_capture(scan).is_imported_cloud:
-        check_accepted(store, accept_rejected)
-        warn_if_stale(store, warn)
+        check_calibration(job)
         model = model or preferred_model(store)
-    cloud = scan_cloud(job, scan, model, accept_rejected, roi)
+    cloud = scan_cloud(job, scan, model, roi)
     job.progress(1.0, "reconstructed")
     return surface_from_cloud(store, scan, cloud, with_region=not roi)
 

@@ -26,7 +26,13 @@ from slviewer.pipeline.cloud_corrections import (
     restriction_notes,
 )
 from slviewer.pipeline.cloud_record import list_outside_depths
-from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
+from slviewer.pipeline.models import (
+    ModelName,
+    check_accepted,
+    check_calibration,
+    frame_of,
+    load_model,
+)
 from slviewer.pipeline.operation import (
     Found,
     Job,
@@ -34,7 +40,6 @@ from slviewer.pipeline.operation import (
     ignore_warnings,
     next_name,
     operation,
-    part,
     placed_file,
     read_record,
     stage,
@@ -196,11 +201,10 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
         Path(settings.out).parent.mkdir(parents=True, exist_ok=True)  # or it fails now
     table_deg = _list_table_angles(store, settings)
     starts = _initial_alignments(job, settings, table_deg)
-    check_accepted(store, settings.accept_rejected)
-    warn_if_stale(store, warn)
+    check_calibration(job)
     restrictions = restriction_notes(store, names, resolve_region(store, settings.roi))
     inputs = restriction_inputs(store, names, with_region=not settings.roi)
-    model, clouds = _read_clouds(replace(job, progress=part(job.progress, 0.0, 0.4)), settings)
+    model, clouds = _read_clouds(job.part(0.0, 0.4), settings)
     if settings.start == "markers" or table_deg is not None:
         markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
         if table_deg is None:
@@ -232,7 +236,7 @@ def _read_clouds(job: Job, settings: MergeSettings) -> tuple[str, dict[str, Clou
     model, clouds, region = "", dict[str, Cloud](), resolve_region(store, roi)
     if own := [n for n in names if not store.load_capture(n).is_imported_cloud]:
         fitted = load_model(store, settings.model)
-        made = reconstruct_captures(job, fitted, own, accept_rejected=settings.accept_rejected)
+        made = reconstruct_captures(job, fitted, own)
         clouds = {shot.name: restrict_cloud(store, shot.name, c, region) for shot, _, c in made}
         model = fitted.name
     return model, {n: clouds[n] if n in own else scan_cloud(job, n, roi=roi) for n in names}
@@ -483,7 +487,7 @@ def align(job: Job, settings: AlignSettings) -> Iterator[Found[Placement]]:
     places found.
     """
     store = job.store
-    check_accepted(store, settings.accept_rejected)
+    check_accepted(store, job.accept_rejected)
     names = list(settings.captures) or [
         name for name, each in list_placements(store).items() if each is None
     ]

@@ -16,6 +16,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.operation import (
     Found,
+    Job,
     SessionLike,
     Warn,
     load_record,
@@ -374,6 +375,13 @@ def check_accepted(store: Session, accept_rejected: bool = False) -> None:
         raise CalibrationRejected(
             f"the calibration was rejected, and is not used without --accept-rejected: {reason}"
         )
+
+
+def check_calibration(job: Job) -> None:
+    """Check the calibration before clouds are made with it: `check_accepted` and
+    `warn_if_stale`."""
+    check_accepted(job.store, job.accept_rejected)
+    warn_if_stale(job.store, job.warn)
 
 
 def accept_rejected_calibration(store: Session, on: bool) -> None:

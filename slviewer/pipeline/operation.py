@@ -22,7 +22,7 @@ from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
 from slviewer.pipeline.cloud_corrections import scale_factor
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
-from slviewer.records.record import Record, from_plain, render_text, to_plain
+from slviewer.records.record import Meta, Record, from_plain, render_text, to_plain
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 
@@ -159,7 +159,7 @@ def save_record(
     store.save_result(f"{record.kind}/{name}", to_plain(record), arrays)
 
 
-def read_record(kind: type[R], meta: Mapping[str, Any]) -> R:
+def read_record(kind: type[R], meta: Meta) -> R:
     """Return the record of a result's `meta`, also of one that an older version stored. InputError
     where it is none."""
     return from_plain(kind.upgrade(meta), kind)
@@ -257,11 +257,17 @@ S = TypeVar("S")
 
 @dataclass(frozen=True)
 class Job:
-    """One run of an operation: its session, and what takes its progress and warnings."""
+    """One run of an operation: its session, what takes its progress and warnings, and whether a
+    calibration is used although its verdict rejects it."""
 
     store: Session
     progress: Progress = ignore_progress
     warn: Warn = ignore_warnings
+    accept_rejected: bool = False
+
+    def part(self, start: float, end: float, label: str = "") -> "Job":
+        """Return the job of a stage, whose progress is mapped as by `part`."""
+        return replace(self, progress=part(self.progress, start, end, label))
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,6 +395,8 @@ class Operation(Generic[P, S, R]):
 
     def find(self, job: Job, settings: S) -> Iterator[Found[Any]]:
         """Yield everything that the operation finds, of any kind, once it is stored."""
+        if getattr(settings, "accept_rejected", False):
+            job = replace(job, accept_rejected=True)
         everything = cast("Generator[Found[Any], None, None]", self.function(job, settings))
         with closing(everything):  # a file that it is about to place is given up where saving fails
             for found in everything:
@@ -437,6 +445,10 @@ class Callbacks:
 
     progress: Progress = ignore_progress
     warn: Warn = ignore_warnings
+
+    def job(self, store: Session) -> Job:
+        """Return the work on a session."""
+        return Job(store, self.progress, self.warn, getattr(self, "accept_rejected", False))
 
 
 def takes_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], V]], Callable[P, V]]:

@@ -3,7 +3,7 @@ capture of its board; and on target poses that it was not made from."""
 
 from collections.abc import Collection, Iterable, Mapping
 from math import hypot
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -12,6 +12,7 @@ from slviewer.records.record import (
     Column,
     Count,
     Mark,
+    Meta,
     Record,
     Table,
     Vector,
@@ -184,10 +185,10 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     test, ``scale_applied`` the one that it put in force; ``time``: ISO 8601, UTC.
     """
 
-    kind: ClassVar[str] = "acceptance"
-    title: ClassVar[str] = "Acceptance"
-    is_history: ClassVar[bool] = True
-    newest_first: ClassVar[bool] = True
+    kind = "acceptance"
+    title = "Acceptance"
+    is_history = True
+    newest_first = True
     artefact: CertifiedArtefact
     model: str
     positions: list[PositionErrors]
@@ -202,7 +203,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     time: str = ""
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Convert a record of version 0.2, whose figures were one entry."""
         if not isinstance(old := meta.get("accepted"), dict):
             return meta
@@ -316,9 +317,9 @@ class Drift(Record, frozen=True, kw_only=True):
     detected. ``time``: ISO 8601, UTC.
     """
 
-    kind: ClassVar[str] = "drift"
-    title: ClassVar[str] = "Drift"
-    is_history: ClassVar[bool] = True
+    kind = "drift"
+    title = "Drift"
+    is_history = True
     capture: str
     axes: tuple[Literal["x", "y"], ...]
     verdict: DriftVerdict
@@ -340,7 +341,7 @@ class Drift(Record, frozen=True, kw_only=True):
     time: str = ""
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Convert a record of version 0.2, whose figures were one entry."""
         if not isinstance(old := meta.get("checked"), Mapping):
             return meta
@@ -447,8 +448,8 @@ class ModelComparison(Record, frozen=True, kw_only=True):
     simplest.
     """
 
-    kind: ClassVar[str] = "validation"
-    title: ClassVar[str] = "Comparison of models"
+    kind = "validation"
+    title = "Comparison of models"
     recommended: str
     models: Annotated[dict[str, HeldOutError], msgspec.Meta(min_length=1)]
     poses: dict[str, dict[str, HeldOutPose]]
@@ -456,7 +457,7 @@ class ModelComparison(Record, frozen=True, kw_only=True):
     failed: dict[str, str] = {}
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Convert a record of version 0.2, whose figures were one entry."""
         if not isinstance(old := meta.get("validation"), Mapping):
             return meta

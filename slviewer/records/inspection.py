@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import msgspec
 
@@ -89,9 +88,9 @@ class Inspection(Record, frozen=True, kw_only=True):
     aligned; without, places are in the camera's frame.
     """
 
-    kind: ClassVar[str] = "inspection"
-    title: ClassVar[str] = "Inspection"
-    newest_first: ClassVar[bool] = True
+    kind = "inspection"
+    title = "Inspection"
+    newest_first = True
     plan: str
     characteristic: tuple[Characteristic, ...]
     parts: tuple[PartResult, ...]

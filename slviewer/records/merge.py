@@ -4,12 +4,11 @@ surface; and where each is while they are captured."""
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from math import acos, degrees, dist
-from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
 
-from slviewer.records.record import Cell, Column, Count, Matrix4, Record, Share, Table, Vector
+from slviewer.records.record import Cell, Column, Count, Matrix4, Meta, Record, Share, Table, Vector
 
 REPORTED_RAISE = 1.2
 """Times its predicted noise that a calibration's residual is, from which raising sigma is
@@ -91,8 +90,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     ``normals`` (h, w, 3), ``sigma_z`` along these, and ``texture`` where they have colours.
     """
 
-    kind: ClassVar[str] = "clouds"
-    title: ClassVar[str] = "Clouds"
+    kind = "clouds"
+    title = "Clouds"
     model: str = ""
     axis: str = "x"
     points: Count = 0
@@ -110,7 +109,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     imported: ImportedPoints | None = None
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Add the settings, which records of version 0.2 lack."""
         captures = [name for name in meta.get("inputs", {}) if "/" not in name]
         if "operation" in meta or not captures:
@@ -306,8 +305,8 @@ class Merge(Record, frozen=True, kw_only=True):
     ``restrictions``: correction of scale, edits and region in words.
     """
 
-    kind: ClassVar[str] = "merge"
-    title: ClassVar[str] = "Merges"
+    kind = "merge"
+    title = "Merges"
     reference: str
     scans: list[str]
     pairs: dict[str, Registered]
@@ -333,7 +332,7 @@ class Merge(Record, frozen=True, kw_only=True):
         return not self.depths
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Add the registered pairs, which merges of version 0.1 lack: theirs are those on the
         reference."""
         if "registered" in meta or not {"pairs", "reference"} <= meta.keys():
@@ -450,8 +449,8 @@ class Placement(Record, frozen=True, kw_only=True):
     that overlap. ``seen_again``: share of the surface that more than one scan sees, of the last.
     """
 
-    kind: ClassVar[str] = "placement"
-    title: ClassVar[str] = "Places of scans"
+    kind = "placement"
+    title = "Places of scans"
     T_first_scan: Matrix4 | None = None
     onto: str = ""
     rms_mm: float | None = None

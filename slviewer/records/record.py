@@ -371,6 +371,8 @@ UNITS = {
 """{last word of a figure's name: (unit, decimals)}."""
 DEPTHS = ("R1", "R2", "R3")
 """In front of, inside and behind the calibrated depths."""
+Meta = Mapping[str, Any]
+"""The entries of a stored record."""
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Vector = tuple[float, float, float]
@@ -417,7 +419,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         RECORDS[cls.kind] = cls
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Return the entries of a stored record with today's names."""
         return meta
 

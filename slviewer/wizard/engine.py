@@ -221,17 +221,6 @@ def request(action: str) -> Callable[[Callable[Concatenate[Handler, P], None]], 
     return decorate
 
 
-def on_session(action: str, function: Callable[Concatenate[Session, P], object]) -> Request[P]:
-    """Return the request that a function of the open session answers."""
-
-    @request(action)
-    def handle(self: Engine, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Call the function with the session."""
-        function(self._store, *args, **kwargs)
-
-    return handle
-
-
 class Engine:
     """The state behind the requests. `capture_now` is called, on the preview's thread, for a
     hands-free capture."""
@@ -378,11 +367,10 @@ class Engine:
         operation: Operation[..., Any, Any],
         settings: Any,
         section: str = "",
-        failed: Callable[[BaseException], None] | None = None,
-        finish: Callable[[Findings[Any]], None] | None = None,
         change: str = "",
+        **callbacks: Any,
     ) -> None:
-        """Queue an operation as `_work`. A calibration that the operator uses although it was
+        """Queue an operation as `_work`, with its ``callbacks``. A calibration that the operator uses although it was
         rejected is used. ``change``: the name under which its results can be undone."""
         opened = self._store
 
@@ -400,7 +388,7 @@ class Engine:
                     if replaced:
                         self._add_change(opened, change, exchange_step(opened, replaced))
 
-        self._work(title, work, section, failed, finish)
+        self._work(title, work, section, **callbacks)
 
     def _add_change(self, store: Session, name: str, reverse: Step) -> None:
         """Add a change of a session to what can be undone, as long as that session is open."""

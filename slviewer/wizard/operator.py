@@ -181,23 +181,20 @@ class Operator(RigRequests, ResultRequests):
         self._capture_pose(name)
 
     @request("Capturing the scan")
-    def capture_scan(self, label: str = "") -> None:
-        """Capture an object and reconstruct it; `label` is the operator's name for it, any text."""
-        self._capture_scan("scan", label)
-
-    @request("Capturing the plane")
-    def capture_plane(self, label: str = "", *, anyway: bool = False) -> None:
-        """Capture a flat plate and compare the models on it; `anyway`: also while the board is in
-        view."""
-        self._require_no_board(anyway)
-        self._capture_scan("plane", label)
-
-    @request("Capturing the sphere")
-    def capture_sphere(self, label: str = "", *, anyway: bool = False) -> None:
-        """Capture a sphere and compare the models on it; `anyway`: also while the board is in
-        view."""
-        self._require_no_board(anyway)
-        self._capture_scan("sphere", label)
+    def capture_scan(
+        self, label: str = "", purpose: Purpose = "scan", *, anyway: bool = False
+    ) -> None:
+        """Capture an object and reconstruct it, or a flat plate or a sphere, and compare the models
+        on it; these `anyway`: also while the board is in view. `label` is the operator's name for
+        it, any text."""
+        if purpose != "scan" and not anyway:
+            self._require_no_board()
+        name = self._next_name(purpose)
+        self._queue_capture(
+            name,
+            self._scan_sequence(),
+            lambda captured: self._save_scan(name, purpose, captured, label),
+        )
 
     @request("Switching hands-free capture")
     def set_hands_free(self, on: bool) -> None:
@@ -225,26 +222,17 @@ class Operator(RigRequests, ResultRequests):
 
         self._queue_capture(name, self._pose_sequence(), save)
 
-    def _require_no_board(self, anyway: bool) -> None:
-        """Raise InputError while the live image shows the board, unless it is wanted there."""
+    def _require_no_board(self) -> None:
+        """Raise InputError while the live image shows the board."""
         view, world = self._preview, self._scene
         board = view.board if view else None
         # what stands before the simulated rig may have been exchanged since the latest image
         is_there = board is not None and (world is None or world.standing == "board")
-        if board and is_there and time.monotonic() - board.time_s < BOARD_S and not anyway:
+        if board and is_there and time.monotonic() - board.time_s < BOARD_S:
             raise InputError(
                 "the board is in view, and would be measured: take it away, or choose to capture"
                 " with the board in view"
             )
-
-    def _capture_scan(self, purpose: Purpose, label: str) -> None:
-        """Queue the capture of a scan, plane or sphere."""
-        name = self._next_name(purpose)
-        self._queue_capture(
-            name,
-            self._scan_sequence(),
-            lambda captured: self._save_scan(name, purpose, captured, label),
-        )
 
     def _save_scan(
         self,
@@ -450,13 +438,12 @@ class Operator(RigRequests, ResultRequests):
                 )
                 folder.mkdir()
                 try:
-                    unpacking, importing = part(job.progress, 0, 0.2), part(job.progress, 0.2, 1)
+                    unpacking = part(job.progress, 0, 0.2)
                     source, warnings = unpack(archive, folder, lambda done: unpacking(done, words))
                     for warning in warnings:
                         job.warn(warning)
                     origin = {"origin": name, **options}
-                    job = replace(job, progress=importing)
-                    return self._import_unpacked(job, source, layout, role, origin)
+                    return self._import_unpacked(job.part(0.2, 1), source, layout, role, origin)
                 finally:
                     atomic.discard(staged)
 

@@ -2,7 +2,6 @@
 results are made from."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -55,11 +54,10 @@ from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_p
 from slviewer.session.names import plain_name, safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
 from slviewer.session.report_details import encode_logo
-from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard.change_requests import ChangeRequests
 from slviewer.wizard.diagnostics import write_bundle
-from slviewer.wizard.engine import on_session, request
+from slviewer.wizard.engine import request
 from slviewer.wizard.jobs import describe_failure
 from slviewer.wizard.result_views import surface_to_measure
 from slviewer.wizard.session_reader import missing_for_splined
@@ -101,9 +99,10 @@ class ResultRequests(ChangeRequests):
         used."""
         self._run("Comparing the models", validate, ValidateSettings(), "calibration")
 
-    accept_rejected_calibration = on_session(
-        "Using the rejected calibration", accept_rejected_calibration
-    )
+    @request("Using the rejected calibration")
+    def accept_rejected_calibration(self, on: bool) -> None:
+        """Use the present calibration although it was rejected, or not."""
+        accept_rejected_calibration(self._store, on)
 
     @request("Verifying")
     def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
@@ -173,7 +172,7 @@ class ResultRequests(ChangeRequests):
         except SlviewerError as error:
             failed(error)
             return
-        self._run(MERGING, merge, settings, "merge", failed, self._finish("merge"))
+        self._run(MERGING, merge, settings, "merge", failed=failed, finish=self._finish("merge"))
 
     def _merge_turn(self, names: list[str]) -> None:
         """Queue the merge of the scans of a turn by the angles of its turntable, and a watertight
@@ -182,14 +181,11 @@ class ResultRequests(ChangeRequests):
         def work(job: Job) -> str:
             """Merge and mesh; returns a sentence about both."""
             settings = MergeSettings(names, names[0], accept_rejected=accepts_rejected(job.store))
-            merging, meshing = part(job.progress, 0, 0.7), part(job.progress, 0.7, 1)
-            found = merge_turn(job.store, settings, merging, job.warn)
+            found = merge_turn(job.store, settings, part(job.progress, 0, 0.7), job.warn)
             finish(found)
             ((number, merged),) = found.items()
             try:
-                words = _export_file(
-                    replace(job, progress=meshing), "merged-mesh", number, "ply", WATERTIGHT
-                )
+                words = _export_file(job.part(0.7, 1), "merged-mesh", number, "ply", WATERTIGHT)
             except Cancelled:
                 raise
             except SlviewerError as error:
@@ -271,7 +267,10 @@ class ResultRequests(ChangeRequests):
 
         self._work("Exporting", write if texture is None else write_textured, "measurements")
 
-    set_report_details = on_session("Changing the title page", Session.set_report_details)
+    @request("Changing the title page")
+    def set_report_details(self, **changed: Any) -> None:
+        """Set some of what the title page of reports states."""
+        self._store.set_report_details(**changed)
 
     @request("Reading the logo")
     def upload_logo(self, name: str, content: bytes) -> None:
@@ -403,7 +402,8 @@ class ResultRequests(ChangeRequests):
             """Report why, in the words of the panel."""
             self._notices.add_failure(COMPARING, _reword(error))
 
-        self._run(COMPARING, compare, settings, "measurements", failed, self._finish("compare"))
+        finish = self._finish("compare")
+        self._run(COMPARING, compare, settings, "measurements", failed=failed, finish=finish)
 
     @request("Writing the table")
     def export_measurements_table(self) -> None:

@@ -54,13 +54,13 @@ class VerifyPanel(StepPanel):
             self._captures = [
                 self.button(
                     "Capture plane",
-                    lambda: operator.capture_plane(label.value, anyway=self._anyway.value),
+                    lambda: operator.capture_scan(label.value, "plane", anyway=self._anyway.value),
                     "square",
                     None,
                 ),
                 self.button(
                     "Capture sphere",
-                    lambda: operator.capture_sphere(label.value, anyway=self._anyway.value),
+                    lambda: operator.capture_scan(label.value, "sphere", anyway=self._anyway.value),
                     "sphere",
                 ),
             ]
