@@ -29,7 +29,7 @@ def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
     name, calibration = f"scale/{model}", f"calibration/{model}"
     if not (model and store.has_result(name) and store.has_result(calibration)):
         return None
-    meta = store.load_result(name, only=())[0]
+    meta = store.load_meta(name)
     return meta if meta["inputs"] == store.input_hashes(calibration) else None
 
 

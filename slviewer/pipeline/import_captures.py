@@ -351,7 +351,7 @@ def _known_projector_size(store: Session) -> tuple[int, int] | None:
     both are missing."""
     sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
     if not sizes and "stereo" in available_models(store):
-        meta = store.load_result("calibration/stereo", only=())[0]
+        meta = store.load_meta("calibration/stereo")
         return tuple(meta["projector"]) if meta.get("projector") else None
     return sizes.pop() if len(sizes) == 1 else None
 

@@ -131,7 +131,7 @@ def lens_warnings(store: Session, capture: Capture) -> tuple[str, ...]:
     than for the calibration's poses."""
     if not capture.lens:
         return ()
-    inputs = store.load_result("calibration/stereo", only=())[0]["inputs"]
+    inputs = store.load_meta("calibration/stereo")["inputs"]
     names = inputs.keys() & set(store.capture_names("calibration"))
     poses = [pose for name in names if (pose := store.load_capture(name)).hash == inputs[name]]
     warnings = []
@@ -206,7 +206,7 @@ def load_stereo_if_complete(store: Session) -> StereoModel | None:
     sizes."""
     if "stereo" not in available_models(store):
         return None
-    meta = store.load_result("calibration/stereo", only=())[0]
+    meta = store.load_meta("calibration/stereo")
     sized = "model" in meta or (meta["camera"] and meta["projector"])
     sized = sized or store.captures(with_frames=True)
     return load_stereo(store) if sized else None
@@ -320,7 +320,7 @@ def _recommend(store: Session) -> tuple[str, str]:
         return compared.recommended, "recommended by the comparison on held-out poses"
     for name in ("splined", "pixelwise"):
         if name in there:
-            inputs = store.load_result(f"calibration/{name}", only=())[0]["inputs"]
+            inputs = store.load_meta(f"calibration/{name}")["inputs"]
             if len(inputs) >= POSES_FOR_PIXELWISE:
                 return name, f"made from {POSES_FOR_PIXELWISE} poses or more"
     if others := there[1:]:

@@ -498,7 +498,7 @@ def scan_cloud(job: Job, name: str, model: str | None = None, roi: str = "") -> 
     capture, fresh = store.load_capture(name), is_up_to_date(store, stored)
     if capture.is_imported_cloud and not fresh:
         raise InputError(f"the points of {name} are missing: import its file again with --force")
-    meta = store.load_result(stored, only=())[0] if fresh else {}
+    meta = store.load_meta(stored) if fresh else {}
     if meta and (capture.is_imported_cloud or model in (None, "", meta["model"])):
         names = set(meta["arrays"]) - {"phase", "modulation"}
         arrays = store.load_result(stored, only=names)[1]

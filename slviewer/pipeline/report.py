@@ -427,7 +427,7 @@ def _describe_calibration(store: Session, name: str) -> list[str]:
     """One model of the session's calibration, by name: what it was made from, its state, its
     accuracy."""
     state = store.state_of(f"calibration/{name}")
-    meta = store.load_result(f"calibration/{name}", only=())[0]
+    meta = store.load_meta(f"calibration/{name}")
     mark = ", the default" if name == preferred_model(store) else ""
     if "imported" not in meta:
         lines = [f"calibration {name}: from {len(meta['inputs'])} poses, {state}{mark}"]

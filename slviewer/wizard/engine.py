@@ -370,8 +370,9 @@ class Engine:
         change: str = "",
         **callbacks: Any,
     ) -> None:
-        """Queue an operation as `_work`, with its ``callbacks``. A calibration that the operator uses although it was
-        rejected is used. ``change``: the name under which its results can be undone."""
+        """Queue an operation as `_work`, with its ``callbacks``. A calibration that the operator
+        uses although it was rejected is used. ``change``: the name under which its results can be
+        undone."""
         opened = self._store
 
         def work(job: Job) -> Findings[Any]:

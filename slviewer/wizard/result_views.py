@@ -126,7 +126,7 @@ def whole_cloud(session: Session, name: str, extrapolated: bool = False) -> Scan
 
 def merged_cloud(session: Session, name: str) -> Ply:
     """Load the merged points of a merge."""
-    return read_ply(session.exports / str(session.load_result(f"merge/{name}", only=())[0]["ply"]))
+    return read_ply(session.exports / str(session.load_meta(f"merge/{name}")["ply"]))
 
 
 def pixel_fits(session: Session) -> Mapping[Axis, PixelFit]:
@@ -180,7 +180,7 @@ def surface_to_measure(store: Session, name: str) -> MeasuredSurface:
     if not is_up_to_date(store, result):
         raise InputError(f"the inputs of {name} have changed: {again}, then measure")
     cut = "" if result == name else str(restriction_inputs(store, [name]))
-    return _read_surface(store.folder, name, store.load_result(result, only=())[0]["hash"], cut)
+    return _read_surface(store.folder, name, store.load_meta(result)["hash"], cut)
 
 
 @lru_cache(maxsize=1)

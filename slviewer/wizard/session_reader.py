@@ -192,7 +192,7 @@ class SessionReader:
         result = f"poses/{capture.name}"
         with suppress(DamagedError):  # the pose is evaluated again
             if self.session.has_result(result):
-                meta = self._load_meta(result)
+                meta = self.session.load_meta(result)
                 made_of = meta["inputs"].get(capture.name), meta.get("target")
                 return meta if made_of == (capture.hash, target) else None
         return None
@@ -245,7 +245,7 @@ class SessionReader:
         stereo = None if calibration is None or calibration.refused else calibration.stereo
         hashes = [(name, self._captures[name].hash) for name in features]
         if stereo:
-            hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
+            hashes.append(("", self.session.load_meta("calibration/stereo")["hash"]))
         return PlanInput(
             Board.parse(target), camera, projector, features, stereo, focal_px, refused,
             tuple(hashes),
@@ -270,7 +270,8 @@ class SessionReader:
             f"the features of {pose.name}", self._load_features, pose, target, meta
         )
         if calibration:
-            if self._load_meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
+            made_from = self.session.load_meta("calibration/stereo").get("inputs", {})
+            if made_from.get(pose.name) == pose.hash:
                 return "used", "", features
             why = calibration.stereo.excluded.get(pose.name, "")
             # such a pose was included again since
@@ -299,7 +300,7 @@ class SessionReader:
         models = available_models(session)
         if "stereo" not in models:
             return None
-        meta = self._load_meta("calibration/stereo")
+        meta = self.session.load_meta("calibration/stereo")
         stereo = load_stereo_if_complete(session)
         if stereo is None:
             return None
@@ -381,10 +382,6 @@ class SessionReader:
             edits=edits,
             undone_edits=undone,
         )
-
-    def _load_meta(self, result: str) -> dict[str, Any]:
-        """Load the `meta` of a result, without its arrays."""
-        return self.session.load_result(result, only=())[0]
 
 
 def _make_features(
