@@ -248,7 +248,7 @@ class MeasurementList(PanelPart):
         ones."""
         session, measured = self.panel.session, self.panel.session.measurements
         names = [each.name for each in measured]
-        values = _list_values(measured)
+        values = {each.name: [q.value for q in each.record.quantities] for each in measured}
         before = self.chosen and self.chosen.name
         if session.folder != self._folder:
             self._folder, self._known, before = session.folder, values, None
@@ -394,11 +394,6 @@ class MeasurementList(PanelPart):
         self._drawn = looks
         if is_loaded:
             self.redraw()
-
-
-def _list_values(measured: Sequence[Stored[Measurement]]) -> dict[str, list[float]]:
-    """Return the values of measurements by their ids."""
-    return {each.name: [q.value for q in each.record.quantities] for each in measured}
 
 
 def _round_range(along: np.ndarray) -> tuple[float, float, float]:

@@ -187,6 +187,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
 
     kind = "acceptance"
     title = "Acceptance"
+    has_figures = False  # repeated, the test would find a scale that was corrected since
     is_history = True
     newest_first = True
     artefact: CertifiedArtefact
@@ -222,10 +223,6 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
             f" {self.model} on {self.time[:10]}:"
             f" {(self.decision or 'not decided').upper()}{missing}"
         )
-
-    def figures(self) -> dict[str, float]:
-        """Return none: repeated, the test would find a scale that was corrected since."""
-        return {}
 
     def list_tables(self, name: str) -> list[Table]:
         """Return the properties, the positions, and the budget of a length."""
@@ -450,6 +447,7 @@ class ModelComparison(Record, frozen=True, kw_only=True):
 
     kind = "validation"
     title = "Comparison of models"
+    has_figures = False  # repeated, each model is fitted to each fold, which takes minutes
     recommended: str
     models: Annotated[dict[str, HeldOutError], msgspec.Meta(min_length=1)]
     poses: dict[str, dict[str, HeldOutPose]]
@@ -473,11 +471,6 @@ class ModelComparison(Record, frozen=True, kw_only=True):
         """Return the error of each model on boards, and the recommended model, in one sentence."""
         errors = ", ".join(f"{model} {each.board_mm:.3f} mm" for model, each in self.models.items())
         return f"held-out error of the models: {errors}; {self.recommended} is recommended"
-
-    def figures(self) -> dict[str, float]:
-        """Return none: to repeat it, every model is fitted again to each fold, which takes
-        minutes."""
-        return {}
 
     def list_tables(self, name: str) -> list[Table]:
         """Return a table of the errors with a line for each model; the least ones are marked."""

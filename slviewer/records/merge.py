@@ -451,6 +451,7 @@ class Placement(Record, frozen=True, kw_only=True):
 
     kind = "placement"
     title = "Places of scans"
+    has_figures = False  # a scan's place depends on the order in which the others were aligned
     T_first_scan: Matrix4 | None = None
     onto: str = ""
     rms_mm: float | None = None
@@ -472,10 +473,6 @@ class Placement(Record, frozen=True, kw_only=True):
         return (
             f"aligned to {self.onto}: RMS {self.rms_mm:.3f} mm, overlap {100 * self.overlap:.0f} %"
         )
-
-    def figures(self) -> dict[str, float]:
-        """Return none: a scan's place depends on the order in which the others were aligned."""
-        return {}
 
     @classmethod
     def tables(cls, found: Mapping[str, "Placement"]) -> list[Table]:  # type: ignore[override]

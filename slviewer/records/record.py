@@ -405,6 +405,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     kind: ClassVar[str] = ""
     title: ClassVar[str] = ""
     is_history: ClassVar[bool] = False  # also records of before are of interest
+    has_figures: ClassVar[bool] = True  # that a repetition finds again
     is_of_captures: ClassVar[bool] = True  # and not shown once these are deleted
     prefix: ClassVar[str] = ""
     labels: ClassVar[str] = "names"
@@ -473,7 +474,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         plain = {
             key: value
             for key, value in to_plain(self).items()
-            if key not in Record.__struct_fields__
+            if self.has_figures and key not in Record.__struct_fields__
         }
         return list_numbers(plain)
 

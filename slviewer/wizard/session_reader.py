@@ -215,7 +215,6 @@ class SessionReader:
                 name=pose.name,
                 state=state,
                 why=why,
-                created=str(pose.meta.get("created", "")),
                 T_camera_board=(T := poses.get(pose.name)),
                 board_px=outline_px(given.board, plan.lens, T)
                 if given and plan and T is not None

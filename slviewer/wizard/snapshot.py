@@ -137,7 +137,6 @@ class PoseView:
     name: str
     state: PoseState
     why: str
-    created: str
     T_camera_board: np.ndarray | None
     board_px: np.ndarray | None
     rms_px: tuple[float, float] | None

@@ -39,7 +39,7 @@ def planned(covered: bool, sigma_mm: float | None = None) -> PosePlan:
 
 
 def poses(n: int, state="good", why: str = "") -> tuple[PoseView, ...]:
-    return tuple(PoseView(f"pose_{i}", state, why, "", None, None, None, b"") for i in range(n))
+    return tuple(PoseView(f"pose_{i}", state, why, None, None, None, b"") for i in range(n))
 
 
 def calibration(stale: str = "") -> CalibrationView:
