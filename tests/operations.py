@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
+from slviewer.pipeline.measure import MeasuredSurface, load_surface
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
 from slviewer.pipeline.operation import Job, ignore_warnings
 from slviewer.pipeline.reconstruct import (

@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.gui.scene import Colour
 from slviewer.gui.widgets import Html, colour_bar, colours, note, paint, paragraph, to_html
-from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.pipeline.measure import MeasuredSurface
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.report.maps import error_limit
 from slviewer.session.ply import Ply

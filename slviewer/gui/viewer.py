@@ -22,7 +22,7 @@ from websockets.http11 import Request, Response
 from slviewer.errors import InputError
 from slviewer.gui.colouring import shade
 from slviewer.gui.scene import FIELD_OF_VIEW, add_points, frame_points, thin
-from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
+from slviewer.pipeline.measure import MeasuredSurface, load_surface
 from slviewer.pipeline.operation import Job, opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals, normals

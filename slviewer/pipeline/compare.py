@@ -16,11 +16,11 @@ from slviewer.inspection.deviation import (
     deviation_colours,
     judge_deviation,
 )
-from slviewer.pipeline.measure import provenance
-from slviewer.pipeline.measured_surface import (
+from slviewer.pipeline.measure import (
     LoadSurface,
     MeasuredSurface,
     load_surface,
+    provenance,
     triangulate_surface,
 )
 from slviewer.pipeline.models import ModelName

@@ -28,8 +28,7 @@ from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import PointErrors
 from slviewer.pipeline.compare import fit_to_nominal
-from slviewer.pipeline.measure import load_feature
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, load_surface
+from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.operation import (
     Findings,

@@ -13,7 +13,7 @@ from slviewer.errors import InputError, UsageError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.pipeline.cloud_corrections import OFF, resolve_region, restriction_notes
 from slviewer.pipeline.export import check_export
-from slviewer.pipeline.measured_surface import MERGED
+from slviewer.pipeline.measure import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.operation import (

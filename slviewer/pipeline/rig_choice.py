@@ -178,6 +178,20 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
     )
 
 
+def place_object(bench: RigSetup) -> None:
+    """Let the stone stand on the turntable before a simulated rig, where a board, plate or ball
+    shows nothing."""
+    if bench.world is not None and bench.world.standing in ("board", "plane", "sphere"):
+        bench.world.place("stone")
+
+
+def require_turntable(rig: Rig) -> Turntable:
+    """Return the rig's turntable. Raises InputError where it has none."""
+    if rig.turntable is None:
+        raise InputError(f"the rig {rig.name} has no turntable: add [turntable] to its file")
+    return rig.turntable
+
+
 def _make_device(part: str, chosen: Choice, **provided: Any) -> Any:
     """Return a device (camera, projector, turntable, or a whole rig) of a driver and its options,
     with those of the ``provided`` arguments that the driver takes from the program."""

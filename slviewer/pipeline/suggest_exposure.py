@@ -135,14 +135,6 @@ def suggest_exposure(
         rig.camera.apply(before)
 
 
-def apply_suggestion(rig: Rig, suggestion: ExposureSuggestion) -> list[float]:
-    """Set the camera as suggested. Returns the exposures of each capture where they are several,
-    else none."""
-    exposures = list(suggestion.exposures_ms)
-    rig.camera.apply(CameraSettings(exposures[0], suggestion.gain))
-    return exposures if len(exposures) > 1 else []
-
-
 @dataclass(eq=False)
 class _Bracket:
     """Looks at the fringes of a scene in several exposures, and the choice among them."""

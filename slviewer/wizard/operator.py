@@ -15,13 +15,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from slviewer.devices.capture import CapturedFrames, capture_with_texture
+from slviewer.devices.capture import CapturedFrames
 from slviewer.devices.protocols import Rig
 from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry import cuda_device
-from slviewer.pipeline.capture import check_space, depth_axis, save_frames
+from slviewer.pipeline.capture import (
+    FULL_TURN_DEG,
+    STEPS,
+    capture_sequence,
+    capture_turn,
+    check_space,
+    depth_axis,
+    missing_steps,
+    next_turn,
+    plan_turn,
+    recorded_steps,
+    save_frames,
+)
 from slviewer.pipeline.import_captures import (
     Role,
     describe_import,
@@ -30,18 +42,7 @@ from slviewer.pipeline.import_captures import (
 )
 from slviewer.pipeline.import_cloud import import_cloud
 from slviewer.pipeline.operation import Job, Progress, part
-from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
-from slviewer.pipeline.turn import (
-    FULL_TURN_DEG,
-    STEPS,
-    capture_turn,
-    missing_steps,
-    next_turn,
-    place_object,
-    plan_turn,
-    recorded_steps,
-    require_turntable,
-)
+from slviewer.pipeline.rig_choice import Choice, SetUp, place_object, require_turntable, set_up
 from slviewer.session import atomic
 from slviewer.session.capture import Purpose, TurnStep
 from slviewer.session.importers.archive import CLOUD_SUFFIXES, unpack, unpacked_size
@@ -377,12 +378,7 @@ class Operator(RigRequests, ResultRequests):
 
             def capture_step(step: TurnStep, progress: Progress) -> None:
                 """Capture and save one step, and queue its reconstruction."""
-                captured = capture_with_texture(
-                    rig,
-                    sequence,
-                    exposures,
-                    progress=lambda done, n: progress(done / n, f"frame {done} of {n}"),
-                )
+                captured = capture_sequence(rig, sequence, exposures, progress)
                 self._save_scan(step.name, "scan", captured, turn_step=step)
 
             capture_turn(rig, steps, capture_step, recorded, progress, self._warner("scans"))

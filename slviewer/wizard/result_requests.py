@@ -13,18 +13,21 @@ from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.accept import ValidateSettings, validate
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
+from slviewer.pipeline.capture import WATERTIGHT, merge_turn
 from slviewer.pipeline.compare import CompareSettings, compare
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
 from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
 from slviewer.pipeline.measure import (
+    MERGED,
+    MeasuredSurface,
     MeasureSettings,
+    Place,
     RelateSettings,
     export_measurements,
     measure,
     relate,
 )
 from slviewer.pipeline.measure import What as Tool
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.pipeline.merge import (
     AlignSettings,
     MergeSettings,
@@ -44,7 +47,6 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.operation import Job, load_record, load_stored, part
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
-from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.record import format_count, from_plain, to_plain

@@ -17,7 +17,7 @@ from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.cloud_corrections import restrict_cloud
-from slviewer.pipeline.measured_surface import (
+from slviewer.pipeline.measure import (
     MERGED,
     MeasuredSurface,
     Place,

@@ -13,7 +13,7 @@ from slviewer.devices.capture import check_exposures
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import DamagedError, DeviceError, InputError, SlviewerError
-from slviewer.fringe.presets import PRESETS
+from slviewer.fringe.presets import find_preset
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture import choose_sequence, depth_axis
 from slviewer.pipeline.duplicate import duplicate_calibration
@@ -328,8 +328,7 @@ class RigRequests(Engine):
     @request("Choosing the patterns")
     def choose_patterns(self, name: str) -> None:
         """Set the pattern sequence of later captures."""
-        if name not in PRESETS:
-            raise InputError(f"no pattern sequence is called {name!r}: use {', '.join(PRESETS)}")
+        find_preset(name)
         self._store.decide("patterns", name)
 
     @request("Setting the wanted accuracy")

@@ -21,7 +21,7 @@ from slviewer.gui.steps.measure import COMPARE, FIT, PICK, Tool
 from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane
-from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.pipeline.measure import MeasuredSurface
 from slviewer.pipeline.operation import Stored
 from slviewer.records.measurement import DECIDED, Measurement, Quantity
 from slviewer.records.record import from_plain, to_plain

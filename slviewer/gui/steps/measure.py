@@ -22,8 +22,7 @@ from slviewer.gui.widgets import Html, Text, colour_bar, note, to_html
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measure import What
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
+from slviewer.pipeline.measure import MERGED, MeasuredSurface, Place, What
 from slviewer.pipeline.operation import Stored, load_arrays
 from slviewer.records.measurement import Measurement
 from slviewer.report.page import round_up
