@@ -249,25 +249,11 @@ class ResultRequests(ChangeRequests):
         if what in ("merge", "merged-mesh"):
             name = self._last_merge("there is no merge yet: merge scans first")
 
-        def write_textured(job: Job) -> str:
-            """Write a mesh with a texture; returns a sentence that begins with the file's name."""
-            source = f"{MERGED}{name}" if what == "merged-mesh" else name
-            path = store.exports / default_file_name(what, name, chosen)
-            made = mesh(
-                store, [source], path, plan=plan, texture=texture, white=white,
-                accept_rejected=accepts_rejected(store), progress=part(job.progress, 0, 0.98),
-                warn=job.warn,
-            )  # fmt: skip
-            assert made.textured is not None
-            job.progress(1.0, "exported")
-            words = made.meshed.text().splitlines()[0]
-            return f"{path.name} is ready to download: {words}; {made.textured.text()}"
-
-        def write(job: Job) -> str:
-            """Write any other file, as `_export_file` does."""
-            return _export_file(job, what, name, chosen, plan)
-
-        self._work("Exporting", write if texture is None else write_textured, "measurements")
+        self._work(
+            "Exporting",
+            lambda job: _export_file(job, what, name, chosen, plan, texture, white),
+            "measurements",
+        )
 
     @request("Changing the title page")
     def set_report_details(self, **changed: Any) -> None:
@@ -447,18 +433,32 @@ class ResultRequests(ChangeRequests):
 
 
 def _export_file(
-    job: Job, what: What, name: str, file_format: str, plan: MeshingPlan | None
+    job: Job,
+    what: What,
+    name: str,
+    file_format: str,
+    plan: MeshingPlan | None,
+    texture: int | None = None,
+    white: str = "",
 ) -> str:
-    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the
-    file's name."""
+    """Write one file, as `pipeline.export.export` does, or a mesh with a texture; returns a
+    sentence that begins with the file's name."""
     store, file_name = job.store, default_file_name(what, name, file_format)
-    with store.staged_export(file_name) as path:
-        exported = export(
-            store, what, name, out=path, plan=plan, accept_rejected=accepts_rejected(store),
-            progress=part(job.progress, 0, 0.98), warn=job.warn,
-        )  # fmt: skip
+    options: dict[str, Any] = {
+        "plan": plan, "accept_rejected": accepts_rejected(store),
+        "progress": part(job.progress, 0, 0.98), "warn": job.warn,
+    }  # fmt: skip
+    if texture is None:
+        with store.staged_export(file_name) as path:
+            words = export(store, what, name, out=path, **options).words
+    else:
+        source = f"{MERGED}{name}" if what == "merged-mesh" else name
+        out = store.exports / file_name
+        made = mesh(store, [source], out, texture=texture, white=white, **options)
+        assert made.textured is not None
+        words = f"{made.meshed.text().splitlines()[0]}; {made.textured.text()}"
     job.progress(1.0, "exported")
-    return f"{file_name} is ready to download: {exported.words}"
+    return f"{file_name} is ready to download: {words}"
 
 
 def _reword(error: BaseException) -> BaseException:
