@@ -168,9 +168,10 @@ def properties_table(title: object, properties: Mapping[str, object]) -> Html:
 
 
 def record_properties(title: object, shown: Table) -> Html:
-    """Return the only row of a table as properties, but for its name, with a title."""
+    """Return the only row of a table but its name as properties, and its first note."""
     (row,) = shown.format(shown.rows)
-    return properties_table(title, {_format_title(column): text for column, text, _ in row[1:]})
+    listed = {_format_title(column): text for column, text, _ in row[1:]}
+    return properties_table(title, listed) + note(shown.notes[0])
 
 
 def _format_title(column: Column) -> str:
