@@ -196,7 +196,7 @@ def merge(job: Job, settings: MergeSettings) -> Iterator[Found[Merge]]:
 def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     """Context manager: registered and fused scans, not stored yet; the file of the merge gets its
     place at the end."""
-    store, names, warn = job.store, settings.names, job.warn
+    job, store, names, warn = job.accepting(settings), job.store, settings.names, job.warn
     if settings.out is not None:
         Path(settings.out).parent.mkdir(parents=True, exist_ok=True)  # or it fails now
     table_deg = _list_table_angles(store, settings)

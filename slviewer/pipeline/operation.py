@@ -265,6 +265,11 @@ class Job:
     warn: Warn = ignore_warnings
     accept_rejected: bool = False
 
+    def accepting(self, settings: Any) -> "Job":
+        """Return the job that uses a rejected calibration where settings accept that."""
+        accepts = self.accept_rejected or getattr(settings, "accept_rejected", False)
+        return replace(self, accept_rejected=accepts)
+
     def part(self, start: float, end: float, label: str = "") -> "Job":
         """Return the job of a stage, whose progress is mapped as by `part`."""
         return replace(self, progress=part(self.progress, start, end, label))
@@ -395,9 +400,8 @@ class Operation(Generic[P, S, R]):
 
     def find(self, job: Job, settings: S) -> Iterator[Found[Any]]:
         """Yield everything that the operation finds, of any kind, once it is stored."""
-        if getattr(settings, "accept_rejected", False):
-            job = replace(job, accept_rejected=True)
-        everything = cast("Generator[Found[Any], None, None]", self.function(job, settings))
+        function = self.function(job.accepting(settings), settings)
+        everything = cast("Generator[Found[Any], None, None]", function)
         with closing(everything):  # a file that it is about to place is given up where saving fails
             for found in everything:
                 record = found.record
@@ -448,7 +452,7 @@ class Callbacks:
 
     def job(self, store: Session) -> Job:
         """Return the work on a session."""
-        return Job(store, self.progress, self.warn, getattr(self, "accept_rejected", False))
+        return Job(store, self.progress, self.warn).accepting(self)
 
 
 def takes_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], V]], Callable[P, V]]:

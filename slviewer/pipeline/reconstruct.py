@@ -131,7 +131,8 @@ def reconstruct(job: Job, settings: ReconstructSettings) -> Iterator[Found[Recon
 def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[ReconstructedCapture]:
     """Context manager: a reconstructed capture, not stored yet; its file gets its place at the
     end."""
-    store, capture, warn = job.store, settings.capture, job.warn
+    job, store, capture = job.accepting(settings), job.store, settings.capture
+    warn = job.warn
     store.load_capture(capture).require_frames("reconstruct")
     check_calibration(job)
     name = settings.model or preferred_model(store)
@@ -322,7 +323,7 @@ def verify(
 
 def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCapture]:
     """Yield the comparison of models on each capture."""
-    store, names = job.store, settings.captures
+    job, store, names = job.accepting(settings), job.store, settings.captures
     for name in names:
         store.load_capture(name).require_frames("verify")
     chosen = load_models(store, settings.models)

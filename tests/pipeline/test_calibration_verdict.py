@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from copies import copy_session
 from facts import missing_facts
+from operations import reconstructed
 
 from slviewer.calibration.observe import Smoothing
 from slviewer.pipeline.calibrate import calibrate, load_last_verdict, save_verdict
@@ -115,6 +116,9 @@ def test_a_rejected_calibration_is_refused_by_every_command(
         "reconstruct", session, "pose_01", "--out", tmp_path / "cloud.ply", "--accept-rejected"
     )
     assert status == 0 and missing_facts(error, "rejected")
+    # as a batch does, without the runner of operations
+    made = reconstructed(session, "pose_01", out=tmp_path / "cloud.ply", accept_rejected=True)
+    assert made.points > 0
 
 
 def refuse(session: Path, pose: str, other: str, ply: Path, run: Run) -> None:
