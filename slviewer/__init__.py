@@ -71,11 +71,11 @@ if TYPE_CHECKING:
     from slviewer.pipeline.merge import align, merge
     from slviewer.pipeline.mesh import mesh
     from slviewer.pipeline.models import load_calibration
+    from slviewer.pipeline.operation import load_arrays
     from slviewer.pipeline.reconstruct import reconstruct, verify
     from slviewer.pipeline.report import report
     from slviewer.pipeline.session_operations import SessionOperations as Session
     from slviewer.pipeline.simulate import simulate
-    from slviewer.pipeline.stored_records import load_arrays
     from slviewer.reconstruction.cloud import Cloud
     from slviewer.reconstruction.reconstruct import reconstruct_cloud
     from slviewer.records.measurement import Measurement, Quantity
@@ -128,7 +128,7 @@ _EXPORTS = {
     "fuse_clouds": "surface.fuse:fuse",
     "gray": "fringe.presets",
     "letter_rig": "simulation.rig:letter",
-    "load_arrays": "pipeline.stored_records",
+    "load_arrays": "pipeline.operation",
     "load_calibration": "pipeline.models",
     "mesh_cloud": "surface.meshing:build_mesh",
     "micro": "fringe.presets",

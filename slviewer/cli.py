@@ -95,7 +95,7 @@ COMMANDS: dict[str, Callable[[], Function]] = {
         run=run_preflight,
     ),
     "capture": _define_command("pipeline.capture:capture", "name", options=PAGES, run=run_capture),
-    "turn": _define_command("pipeline.turn:turn", options=(*PAGES, *JSON), run=run_turn),
+    "turn": _define_command("pipeline.capture:turn", options=(*PAGES, *JSON), run=run_turn),
     "plan-rig": _define_command(
         "pipeline.plan_rig:plan_rig", "camera", "projector", "distance", options=JSON
     ),

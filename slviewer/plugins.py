@@ -50,8 +50,8 @@ from slviewer.errors import (
 from slviewer.fringe.patterns import render_pattern as render
 from slviewer.fringe.presets import complementary, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
-from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import check_imported_capture
+from slviewer.pipeline.operation import ignore_warnings
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,

@@ -4,10 +4,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from slviewer.pipeline.feedback import ignore_warnings
-from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
+from slviewer.pipeline.measure import MeasuredSurface, load_surface
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operation import Job, ignore_warnings
 from slviewer.pipeline.reconstruct import (
     ReconstructedCapture,
     ReconstructSettings,

@@ -12,7 +12,7 @@ from facts import raises
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 
 
 @dataclass(frozen=True, eq=False)

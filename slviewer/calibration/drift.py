@@ -36,7 +36,7 @@ from slviewer.geometry.rigid import Floats, Mask, move_points, rigid_transform
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 from slviewer.geometry.splines import basis_matrix, second_differences
 from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
-from slviewer.records.drift import Drift
+from slviewer.records.acceptance import Drift
 from slviewer.records.record import to_vector
 
 FALSE_ALARMS = 1e-4

@@ -36,7 +36,7 @@ from slviewer.geometry.vectors import (
     unit_vectors,
 )
 from slviewer.records.calibration import Reprojection, StereoFit, describe_stereo
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 
 MIN_FEATURES = 12
 MAX_FOCAL_SIGMA = 0.05

@@ -178,7 +178,7 @@ def write_json(path: Path | None, result: object) -> None:
     """Write a result, plain values or dataclasses, to the file of ``--json``; nothing without
     one."""
     if path is not None:
-        from slviewer.records.plain import to_plain  # lazily: it brings NumPy
+        from slviewer.records.record import to_plain  # lazily: it brings NumPy
 
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(result, indent=2, default=to_plain) + "\n")

@@ -38,7 +38,7 @@ from slviewer.records.acceptance import (
     StillCaptures,
     worst_decision,
 )
-from slviewer.records.plain import from_plain
+from slviewer.records.record import from_plain
 
 Kind = Literal["ball-bar", "sphere", "plane"]
 BALLS = {"ball-bar": 2, "sphere": 1, "plane": 0}

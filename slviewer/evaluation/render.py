@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from slviewer.records.table import Row, Table, render_text
+from slviewer.records.record import Row, Table, render_text
 
 
 def render(rows: Sequence[Row]) -> str:

@@ -115,6 +115,13 @@ PRESETS: dict[str, Callable[[Size], PatternSequence]] = {
 }
 
 
+def find_preset(name: str) -> Callable[[Size], PatternSequence]:
+    """Return the preset of that name. Raises InputError where there is none."""
+    if name not in PRESETS:
+        raise InputError(f"no pattern sequence is called {name!r}: use {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
 def phase_steps(axis: Axis, steps: int, period_px: float) -> list[Frame]:
     """Return all steps of one period, in order."""
     return [

@@ -7,8 +7,8 @@ import numpy as np
 
 from slviewer.gui.panel import PanelPart, StepPanel
 from slviewer.gui.widgets import Html, Picture, Text, coloured, paragraph
+from slviewer.pipeline.capture import FULL_TURN_DEG, STEPS
 from slviewer.pipeline.suggest_exposure import BUDGET_S, STATES, ExposureSuggestion
-from slviewer.pipeline.turn import FULL_TURN_DEG, STEPS
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.session.capture import Role
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel

@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.gui.scene import Colour
 from slviewer.gui.widgets import Html, colour_bar, colours, note, paint, paragraph, to_html
-from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.pipeline.measure import MeasuredSurface
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.report.maps import error_limit
 from slviewer.session.ply import Ply
@@ -101,7 +101,8 @@ def paint_points(shown: PointValues, colour: str) -> tuple[np.ndarray, Html]:
         legend = colour_bar(f"−{limit:g} {how.unit}", f"+{limit:g} {how.unit}", "error", title)
     else:
         known = np.where(np.isfinite(shown.points[..., 2]), how.factor * values, np.nan)
-        grey = "; grey: unknown" if _is_partly_unknown(known, shown.points) else ""
+        unknown = np.isnan(known) & np.isfinite(shown.points[..., 2])
+        grey = "; grey: unknown" if unknown.any() else ""
         painted, legend = paint(known, how.unit, how.digits, f"{title}{grey}", how.kind)
     return shade(painted, shown.normals), in_view(legend)
 
@@ -199,8 +200,3 @@ def uncertainty(cloud: ScanCloud) -> np.ndarray:
     for part in (cloud.sigma_calibration, cloud.sigma_edges):
         sigma = sigma if part is None else np.hypot(sigma, part)
     return np.asarray(sigma)
-
-
-def _is_partly_unknown(values: np.ndarray, points: np.ndarray) -> bool:
-    """Whether values (...) are not known of some of the measured points (..., 3)."""
-    return bool((np.isnan(values) & np.isfinite(points[..., 2])).any())

@@ -36,13 +36,11 @@ from slviewer.inspection.section import (
 )
 from slviewer.pipeline.inspect_parts import FILES
 from slviewer.pipeline.measure import section_lines
-from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
+from slviewer.pipeline.operation import Stored, load_arrays, name_records
 from slviewer.records.inspection import RULE, Characteristic, CharacteristicResult, Inspection
 from slviewer.records.measurement import Measurement, list_quantities
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import relabel
-from slviewer.report.canvas import finish_figure, new_figure, style_axes
-from slviewer.report.page import Figure
+from slviewer.records.record import from_plain, relabel, to_plain
+from slviewer.report.page import Figure, finish_figure, new_figure, style_axes
 from slviewer.report.surfaces import draw_deviations, section_plot
 from slviewer.session.inspection_plan import OWN_PLAN
 from slviewer.wizard.result_requests import PLAN, TABLE
@@ -250,7 +248,7 @@ class MeasurementList(PanelPart):
         ones."""
         session, measured = self.panel.session, self.panel.session.measurements
         names = [each.name for each in measured]
-        values = _list_values(measured)
+        values = {each.name: [q.value for q in each.record.quantities] for each in measured}
         before = self.chosen and self.chosen.name
         if session.folder != self._folder:
             self._folder, self._known, before = session.folder, values, None
@@ -396,11 +394,6 @@ class MeasurementList(PanelPart):
         self._drawn = looks
         if is_loaded:
             self.redraw()
-
-
-def _list_values(measured: Sequence[Stored[Measurement]]) -> dict[str, list[float]]:
-    """Return the values of measurements by their ids."""
-    return {each.name: [q.value for q in each.record.quantities] for each in measured}
 
 
 def _round_range(along: np.ndarray) -> tuple[float, float, float]:

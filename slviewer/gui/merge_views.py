@@ -36,10 +36,10 @@ from slviewer.gui.widgets import (
     table,
     to_html,
 )
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.operation import Stored
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.merge import Merge
-from slviewer.records.table import use_labels
+from slviewer.records.record import use_labels
 from slviewer.registration.multiway import Pair
 from slviewer.registration.refusal import Reason
 from slviewer.registration.spread import measure_spread

@@ -23,7 +23,7 @@ from slviewer.gui.widgets import NOTICES, link, paragraph
 from slviewer.server.secure import SafeServer
 from slviewer.session.recent import RecentSessions
 from slviewer.session.store import Session
-from slviewer.wizard.notices import describe_failure
+from slviewer.wizard.jobs import describe_failure
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import ExportView, Level, PreviewView, ScanView, SessionView, Snapshot
 

@@ -1,8 +1,7 @@
 """The frame of the page: the steps on the left, the current step on the right, and what is visible
-in every step; and the links for other people and devices.
+in every step; what is in the 3D view; and the links for other people and devices.
 
-All browsers show the same step: an assistant sees the operator's step.
-"""
+All browsers show the same step: an assistant sees the operator's step."""
 
 import base64
 import html
@@ -10,7 +9,7 @@ import importlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
 import cv2
@@ -19,10 +18,9 @@ import viser
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.gui.panel import NO_SESSION, ControlGroup, PanelContext, StepPanel
-from slviewer.gui.scene import CAMERA, PROJECTOR
+from slviewer.gui.scene import CAMERA, PROJECTOR, SceneLayer
 from slviewer.gui.start import START, StartPanel
 from slviewer.gui.undo_controls import UndoControls
-from slviewer.gui.view_tree import ViewTree
 from slviewer.gui.widgets import (
     NOTICES,
     STEPS_PAGE,
@@ -37,7 +35,7 @@ from slviewer.gui.widgets import (
     paragraph,
     to_html,
 )
-from slviewer.records.table import format_counts
+from slviewer.records.record import format_counts
 from slviewer.session.atomic import format_bytes
 from slviewer.session.importers.clouds import FORMATS
 from slviewer.wizard.autopilot import Autopilot
@@ -51,6 +49,56 @@ from slviewer.wizard.snapshot import (
     Snapshot,
     StepView,
 )
+
+_EYES = {True: viser.Icon.EYE, False: viser.Icon.EYE_OFF}
+
+
+class ViewTree(ControlGroup):
+    """Inputs of the 3D view, for all browsers; the list follows the scene."""
+
+    def __init__(self, context: PanelContext) -> None:
+        super().__init__(context)
+        gui = self._gui
+        self._size: Any = gui.add_slider(
+            "Point size", 0.25, 4.0, 0.25, 1.0, hint="Of all clouds, relative to their spacing"
+        )
+        self.react(self._size.on_update, lambda: context.scene.scale_points(self._size.value))
+        self._eyes: dict[tuple[str, str], viser.GuiButtonHandle] = {}
+        self._is_requested = False
+        self._hint = Text(gui)
+        self._hint.write("Press an object to hide it, or to show it again.", "dim")
+        self._folder = gui.add_folder("In the view")
+        context.scene.on_change = self._request
+
+    def draw(self) -> None:
+        """List the objects of the layers that are shown."""
+        self._is_requested = False
+        listed: dict[tuple[str, str], tuple[SceneLayer, str, bool]] = {
+            (layer.name, name): (layer, *about)
+            for layer in self._scene.layers
+            for name, about in layer.list_objects().items()
+        }
+        for key in self._eyes.keys() - listed.keys():
+            self._eyes.pop(key).remove()
+        for key, (layer, title, visible) in listed.items():
+            if key not in self._eyes:
+                with self._folder:
+                    self._eyes[key] = self.button(
+                        title,
+                        partial(layer.toggle, key[1]),
+                        "eye",
+                        hint="Shows or hides it in the view",
+                    )
+            eye = self._eyes[key]
+            if (eye.label, eye.icon) != (title, _EYES[visible]):  # each would be sent
+                eye.label, eye.icon = title, _EYES[visible]
+
+    def _request(self) -> None:
+        """Draw once more, after what is drawn now."""
+        if not self._is_requested:
+            self._is_requested = True
+            self.context.submit(self.draw)
+
 
 STEPS_PX, STEP_PX = 160, 340
 """Widths of the two panels: at 1280 px of page, the scene keeps 60 % of it."""

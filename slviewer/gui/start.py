@@ -18,7 +18,7 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.session.recent import MOST_RECENT, new_session_folder, sessions_folder
-from slviewer.wizard.session_overview import SessionOverview, read_overview
+from slviewer.wizard.session_reader import SessionOverview, read_overview
 
 START = "start"
 _PICTURE_PX = 96
@@ -84,7 +84,7 @@ class StartPanel(StepPanel):
         with gui.add_folder("Recent sessions") as self._recent_folder:
             Text(gui).write("Duplicate: a new session with the same calibration.", "dim")
             self._rows = [RecentSession(self) for _ in range(MOST_RECENT)]
-            self._restore = self.button("Restore", self._restore_last, "arrow-back-up")
+            self._restore = self.button("Restore", self.context.recent.restore, "arrow-back-up")
         with gui.add_folder("Another folder", expand_by_default=False):
             folder = gui.add_text("Folder", "", hint="Of a session; created if it does not exist")
             self.button("Open session", lambda: self.open_session(folder.value), "folder-open")
@@ -143,10 +143,6 @@ class StartPanel(StepPanel):
         folder = sessions_folder() / name if name else new_session_folder()
         if self._operator.open_session(folder, is_new=True):
             self._opened()
-
-    def _restore_last(self) -> None:
-        """Bring the session that was deleted last back."""
-        self.context.recent.restore()
 
 
 def overview_html(overview: SessionOverview) -> Html:

@@ -5,7 +5,7 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html import escape
 from http import HTTPStatus
 from pathlib import Path
@@ -22,9 +22,8 @@ from websockets.http11 import Request, Response
 from slviewer.errors import InputError
 from slviewer.gui.colouring import shade
 from slviewer.gui.scene import FIELD_OF_VIEW, add_points, frame_points, thin
-from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
-from slviewer.pipeline.operation import Job
-from slviewer.pipeline.stored_records import opened
+from slviewer.pipeline.measure import MeasuredSurface, load_surface
+from slviewer.pipeline.operation import Job, opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals, normals
 from slviewer.server import viser_internals
@@ -44,17 +43,6 @@ FRAME_SCRIPT = (
 )
 """Browsers deny their storage to a frame of another site's page, such as a notebook's, and viser's
 page ends without one."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Shape:
-    """What is drawn: points (h, w, 3) or (n, 3) mm, and where known normals like them, their
-    colours (...) or (..., 3) uint8, and faces (m, 3) of points (n, 3)."""
-
-    points: np.ndarray
-    normals: np.ndarray | None = None
-    colours: np.ndarray | None = None
-    faces: np.ndarray | None = None
 
 
 class Viewer:
@@ -150,8 +138,9 @@ def _serve(
     return serve_websockets(handler, host, port, process_request=answer, **options)
 
 
-def _find_shape(what: Any, name: str) -> _Shape:
-    """Return what is to be drawn of any of the kinds that `show` takes."""
+def _find_shape(what: Any, name: str) -> Ply:
+    """Return what is to be drawn of any of the kinds that `show` takes: points (h, w, 3) or (n, 3)
+    mm, and where known normals like them, colours (...) or (..., 3) uint8, and faces."""
     if isinstance(what, str | os.PathLike | Session):
         path = what if isinstance(what, Session) else expand_user(Path(what))
         if isinstance(path, Path) and path.is_file():
@@ -164,24 +153,24 @@ def _find_shape(what: Any, name: str) -> _Shape:
         what = getattr(what, wrapper, what)
     match what:
         case Cloud():
-            return _Shape(what.points, cloud_normals(what), what.texture)
+            return Ply(what.points, what.texture, cloud_normals(what))
         case MeasuredSurface():
-            return _Shape(what.points, what.normals, what.texture, what.faces)
+            return Ply(what.points, what.texture, what.normals, faces=what.faces)
         case Mesh():
-            return _Shape(what.vertices, what.normals, what.colours, what.faces)
+            return Ply(what.vertices, what.colours, what.normals, faces=what.faces)
         case PointSet():
-            return _Shape(what.points, what.normals, what.colours)
+            return Ply(what.points, what.colours, what.normals)
         case Ply():
-            return _Shape(what.points, what.normals, what.colours, what.faces)
+            return what
         case np.ndarray() if what.ndim in (2, 3) and what.shape[-1] == 3:
-            return _Shape(what, normals(what) if what.ndim == 3 else None)
+            return Ply(what, None, normals(what) if what.ndim == 3 else None)
     raise InputError(
         f"{type(what).__name__} cannot be shown: give a cloud, points (..., 3), a mesh, a PLY file,"
         " or a session and a scan."
     )
 
 
-def _draw(scene: viser.SceneApi, shape: _Shape) -> None:
+def _draw(scene: viser.SceneApi, shape: Ply) -> None:
     """Draw a mesh, or points in their colours, shaded as in the wizard."""
     points, faces = shape.points, shape.faces
     if faces is not None and len(faces):

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.io import wavfile
 
 from slviewer.errors import hide_passwords
-from slviewer.pipeline.stored_records import Stored, name_records
-from slviewer.records.table import Mark, Table, relabel
+from slviewer.pipeline.operation import Stored, name_records
+from slviewer.records.record import Column, Mark, Table, relabel
 from slviewer.report.page import Figure
 from slviewer.server.help_pages import PREFIX
 from slviewer.server.text import escape
@@ -167,15 +167,24 @@ def properties_table(title: object, properties: Mapping[str, object]) -> Html:
     return table((title, ""), rows)
 
 
+def record_properties(title: object, shown: Table) -> Html:
+    """Return the only row of a table but its name as properties, and its first note."""
+    (row,) = shown.format(shown.rows)
+    listed = {_format_title(column): text for column, text, _ in row[1:]}
+    return properties_table(title, listed) + note(shown.notes[0])
+
+
+def _format_title(column: Column) -> str:
+    """Return a column's title with its unit."""
+    return f"{column.title[:1].upper()}{column.title[1:]}{column.unit and f', {column.unit}'}"
+
+
 def report_table(shown: Table) -> Html:
     """Return a table of figures without its details, with its notes."""
     tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
     shown = shown.without_details()
-    titles = [
-        f"{c.title[:1].upper()}{c.title[1:]}{c.unit and f', {c.unit}'}" for c in shown.columns
-    ]
     # a line ends between words, in any font
-    titles = [title.replace("-", NO_BREAK_HYPHEN) for title in titles]
+    titles = [_format_title(each).replace("-", NO_BREAK_HYPHEN) for each in shown.columns]
     rows = [
         [
             coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))

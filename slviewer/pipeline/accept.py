@@ -8,7 +8,7 @@ without stretching.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -44,13 +44,13 @@ from slviewer.pipeline.capture_phases import (
     look_at_capture,
     match_second,
 )
-from slviewer.pipeline.feedback import Progress, part, stage
+from slviewer.pipeline.cloud_corrections import record_scale, scale_factor
 from slviewer.pipeline.models import (
     MODELS,
     Model,
     ModelName,
     available_models,
-    check_accepted,
+    check_calibration,
     load_model,
     load_pair,
     load_stereo,
@@ -58,17 +58,32 @@ from slviewer.pipeline.models import (
     warn_if_frame_changed,
     warn_if_stale,
 )
-from slviewer.pipeline.operation import Found, Job, operation
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
+    Progress,
+    list_records,
+    load_record,
+    match_names,
+    operation,
+    part,
+    stage,
+)
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import check_capture_sizes, reconstruct_captures, segment_board
-from slviewer.pipeline.scale import record_scale, scale_factor
-from slviewer.pipeline.stored_records import list_records, load_record, match_names
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.camera_match import epipolar_lines
-from slviewer.records.acceptance import AcceptanceTest, Contribution, ErrorBudget, PositionErrors
+from slviewer.records.acceptance import (
+    AcceptanceTest,
+    Contribution,
+    Drift,
+    ErrorBudget,
+    HeldOutError,
+    HeldOutPose,
+    ModelComparison,
+    PositionErrors,
+)
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.drift import Drift
-from slviewer.records.model_comparison import HeldOutError, HeldOutPose, ModelComparison
 from slviewer.session.reading import read_toml
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -117,10 +132,9 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
     """
     store, still = job.store, settings.still
     certified = read_artefact(settings.artefact)
-    check_accepted(store)
+    check_calibration(job)
     chosen = load_model(store, settings.model)
     name, factor = chosen.name, scale_factor(store, chosen.name)
-    warn_if_stale(store, job.warn)
     if settings.apply_scale and certified.kind == "plane":
         raise InputError(
             "the scale cannot be measured on a plane: apply that of a ball bar or a sphere"
@@ -130,13 +144,13 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
         matches = match_names(store.capture_names(), [pattern], "capture", InputError)
         captures |= {each: position if len(matches) == 1 else each for each in matches}
     check_capture_sizes(store, [*captures, *still])
-    measuring = replace(job, progress=part(job.progress, 0.0, 0.5 if still else 0.9))
+    measuring = job.part(0.0, 0.5 if still else 0.9)
     test = conclude_test(
         certified, name, _measure_positions(measuring, certified, chosen, captures)
     )
     repeated = None
     if still:
-        again = replace(job, progress=part(job.progress, 0.5, 0.95))
+        again = job.part(0.5, 0.95)
         repeats = reconstruct_captures(again, chosen, still, "repeating", examine=False)
         repeated = repeatability((cloud.points[..., 2], cloud.sigma_z) for *_, cloud in repeats)
     applied = record_scale(store, test) if settings.apply_scale else None

@@ -19,9 +19,17 @@ import numpy as np
 from slviewer import __version__
 from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
 from slviewer.evaluation.render import render
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.operation import Callbacks, Findings, Job, takes_settings
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Findings,
+    Job,
+    Progress,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
+    takes_settings,
+)
 from slviewer.pipeline.reconstruct import (
     ReconstructSettings,
     VerifySettings,

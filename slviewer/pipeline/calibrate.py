@@ -36,10 +36,8 @@ from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.lens import Lens
 from slviewer.pipeline.capture_phases import capture_texture, convert_to_8bit, decode_or_explain
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import (
     MODELS,
-    VERDICT,
     Model,
     ModelName,
     available_models,
@@ -48,14 +46,28 @@ from slviewer.pipeline.models import (
     save_compiled,
     save_model,
     save_projector,
+    save_verdict,
     trash_models,
     warn_if_frame_changed,
 )
-from slviewer.pipeline.operation import Found, Job, operation
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
+    Progress,
+    SessionLike,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
+    load_record,
+    match_names,
+    opened_or_made,
+    operation,
+    part,
+    stage,
+)
 from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
-from slviewer.pipeline.stored_records import SessionLike, load_record, match_names, opened_or_made
 from slviewer.records.calibration import SECOND_CAMERA, ModelCalibration
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
 from slviewer.session.exporters import write_calibration
@@ -484,23 +496,6 @@ def _warn_of_failure(name: str, models: Sequence[str], warn: Warn) -> Iterator[N
         if len(models) == 1:
             raise
         warn(f"no {name} model: {error}")
-
-
-def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None:
-    """Save the verdict on an attempt to calibrate from these poses, whether or not it succeeded."""
-    store.save_result(
-        VERDICT, {"verdict": to_plain(verdict), "inputs": store.input_hashes(*poses)}, {}
-    )
-
-
-def load_last_verdict(store: Session) -> Verdict | None:
-    """Load the verdict on the last attempt to calibrate, also a failed one; None before the
-    first."""
-    if not store.has_result(VERDICT):
-        return None
-    return store.decode_result(
-        VERDICT, lambda meta, _: from_plain(meta["verdict"], Verdict), only=()
-    )
 
 
 def rejection_error(verdict: Verdict, is_saved: bool) -> CalibrationRejected:

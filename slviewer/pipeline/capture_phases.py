@@ -22,9 +22,15 @@ from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.examination import examine_frames, load_examination, load_or_save_examination
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import load_pair
-from slviewer.pipeline.stored_records import SessionLike, opened
+from slviewer.pipeline.operation import (
+    Progress,
+    SessionLike,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
+    opened,
+)
 from slviewer.reconstruction.camera_match import Lines, epipolar_lines, match_cameras
 from slviewer.records.verdict import Examination
 from slviewer.report.maps import REASON_LABELS, phase_maps, reason_shares

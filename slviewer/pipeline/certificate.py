@@ -22,22 +22,22 @@ import numpy as np
 from slviewer import __version__
 from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.cloud_corrections import load_scale_correction
 from slviewer.pipeline.models import available_models
-from slviewer.pipeline.operation import Job
-from slviewer.pipeline.operations import OPERATIONS
-from slviewer.pipeline.scale import load_scale_correction
-from slviewer.pipeline.stored_records import (
+from slviewer.pipeline.operation import (
+    Job,
+    Progress,
     SessionLike,
+    ignore_progress,
     list_records,
     load_record,
     opened,
     save_record,
 )
+from slviewer.pipeline.operations import OPERATIONS
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.kinds import RECORDS
-from slviewer.records.record import Record
-from slviewer.records.table import Column, Rows, Table, format_count
+from slviewer.records.record import Column, Record, Rows, Table, format_count
 from slviewer.report.page import CERTIFICATE, Section, page_digest, split_page
 from slviewer.session.atomic import to_json
 from slviewer.session.capture import Capture

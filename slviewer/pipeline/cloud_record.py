@@ -8,12 +8,11 @@ import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.fringe.phase import PhaseMap
-from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.cloud_corrections import describe_calibration, scale_factor
 from slviewer.pipeline.models import Model, frame_of, load_stereo
-from slviewer.pipeline.operation import Found, plain_settings
-from slviewer.pipeline.scale import describe_calibration, scale_factor
+from slviewer.pipeline.operation import Found, Warn, plain_settings
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.records.reconstruction import DepthCheck, Reconstruction
+from slviewer.records.merge import DepthCheck, Reconstruction
 from slviewer.session.names import join_names
 from slviewer.session.store import Session
 

@@ -16,17 +16,15 @@ from slviewer.inspection.deviation import (
     deviation_colours,
     judge_deviation,
 )
-from slviewer.pipeline.feedback import part, stage
-from slviewer.pipeline.measure import provenance
-from slviewer.pipeline.measured_surface import (
+from slviewer.pipeline.measure import (
     LoadSurface,
     MeasuredSurface,
     load_surface,
+    provenance,
     triangulate_surface,
 )
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.stored_records import placed_file
+from slviewer.pipeline.operation import Found, Job, operation, placed_file, stage
 from slviewer.records.measurement import (
     LEAST_AREA,
     DeviationStatistics,
@@ -107,10 +105,7 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         raise InputError(f"{path.name} is not the nominal model that it was: it has changed since")
     for note in nominal.notes:
         job.warn(f"{nominal.name}: {note}")
-    loading = replace(job, progress=part(job.progress, 0.0, 0.4))
-    on = load_surface(
-        loading, settings.scan, settings.model, "", settings.accept_rejected, settings.load
-    )
+    on = load_surface(job.part(0.0, 0.4), settings.scan, settings.model, load=settings.load)
     aligning = stage(job.progress, 0.4, 0.9, "aligning")
     result = fit_to_nominal(on, nominal, settings.reach, aligning)
     if result.turned:

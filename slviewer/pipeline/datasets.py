@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slviewer.errors import InputError
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.operation import Progress, ignore_progress, part
 from slviewer.session.importers.archive import unpack
 from slviewer.simulation.assets import asset
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.printable import format_csv
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.session.atomic import replace_file
 from slviewer.session.importers.images import read_image
 from slviewer.target.board import Board

@@ -8,12 +8,20 @@ from datetime import UTC, datetime
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.cloud_corrections import OFF, parse_region
 from slviewer.pipeline.models import ModelName, check_accepted
-from slviewer.pipeline.operation import Callbacks, Job, takes_settings
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Job,
+    Progress,
+    SessionLike,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
+    opened,
+    takes_settings,
+)
 from slviewer.pipeline.reconstruct import scan_cloud
-from slviewer.pipeline.scan_edits import OFF, parse_region
-from slviewer.pipeline.stored_records import SessionLike, opened
 from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
@@ -130,8 +138,7 @@ def edit_scan(settings: EditSettings) -> ScanEdits:
             store.load_capture(scan)
         else:
             check_accepted(store, settings.accept_rejected)
-            job, plane = Job(store, settings.progress, settings.warn), None
-            cloud = scan_cloud(job, scan, settings.model, settings.accept_rejected)
+            cloud, plane = scan_cloud(settings.job(store), scan, settings.model), None
             if cloud.normals is not None:
                 raise InputError(
                     f"{scan} was imported as a cloud, whose points are not those of pixels: cut it"
@@ -258,7 +265,8 @@ def set_region(
         region = load_region(store, even_if_off=True)
         if around:
             check_accepted(store, accept_rejected)
-            cloud = scan_cloud(Job(store, progress, warn), around, model, accept_rejected, OFF)
+            job = Job(store, progress, warn, accept_rejected)
+            cloud = scan_cloud(job, around, model, OFF)
             region = RegionOfInterest.around(cloud.points)
         elif roi not in ("", OFF, "on"):
             region = parse_region(roi)

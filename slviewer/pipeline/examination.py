@@ -1,18 +1,182 @@
-"""Examination of a capture's frames, computed once and saved as `trust/<name>`."""
+"""Checks of a capture's frames: their examination, computed once and saved as `trust/<name>`, and
+whether they are too bright or too dark; and the results of the checks of a rig or of a capture."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from slviewer.examination.examine import examine
 from slviewer.examination.light import Look
-from slviewer.fringe.sequence import PatternSequence
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.fringe.cosines import select_rows
+from slviewer.fringe.layout import white_level
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.pipeline.operation import Warn
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
+
+CheckVerdict = Literal["good", "warning", "bad", "unknown"]
+"""Fit to capture; with reservations; not before it is corrected; could not be determined."""
+
+CheckName = Literal[
+    "screen", "latency", "order", "repeats", "exposure", "gamma", "pixels", "flicker", "ambient",
+    "motion", "burst",
+    "turntable", "description", "noise", "decoding",
+]  # fmt: skip
+
+_WORST_FIRST: tuple[CheckVerdict, ...] = ("bad", "warning", "good")
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of one check: the finding in a ``sentence``; the ``remedy``, empty where none is
+    needed; and the ``figures`` that it is based on, whose names contain their units.
+    """
+
+    name: CheckName
+    verdict: CheckVerdict
+    sentence: str
+    remedy: str
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """All checks of one rig, and what follows from them for its captures.
+
+    ``settle_ms``: what `Rig.settle_ms` should be, None where it could not be measured. ``levels``:
+    the table for `PatternSequence.levels` that makes the light proportional, None where it was not
+    measured. ``exposure_ms``: the exposure to set, None where the one that is set is right, or
+    unknown. ``seconds``: how long it took.
+    """
+
+    checks: tuple[Check, ...]
+    settle_ms: float | None
+    levels: tuple[int, ...] | None
+    exposure_ms: float | None
+    seconds: float
+
+    @property
+    def verdict(self) -> CheckVerdict:
+        """The worst of all checks; what is unknown does not make a good rig worse."""
+        verdicts = {check.verdict for check in self.checks}
+        return next((verdict for verdict in _WORST_FIRST if verdict in verdicts), "unknown")
+
+    def join(self, second: "Preflight") -> "Preflight":
+        """Return the checks of two cameras: of each the worse one, which says where it is the
+        ``second`` camera's. The longer wait is set, and the shorter exposure, if both are wrong."""
+        others = {check.name: check for check in second.checks}
+        joined = []
+        for check in self.checks:
+            other = others.get(check.name, check)
+            pair = Preflight((check, other), None, None, None, 0.0)
+            if other.verdict == pair.verdict != check.verdict:
+                check = replace(other, sentence=f"Second camera: {other.sentence}")
+            joined.append(check)
+        settle = self.settle_ms, second.settle_ms
+        exposure = self.exposure_ms, second.exposure_ms
+        return Preflight(
+            tuple(joined),
+            None if None in settle else max(filter(None, settle), default=0.0),
+            self.levels,
+            None if None in exposure else min(filter(None, exposure), default=None),
+            self.seconds + second.seconds,
+        )
+
+    def check(self, name: CheckName) -> Check:
+        """The check called `name`. Raises KeyError."""
+        return {check.name: check for check in self.checks}[name]
+
+    @property
+    def failure(self) -> str:
+        """Why the command ends with status 1; empty unless something is bad."""
+        if self.verdict != "bad":
+            return ""
+        return (
+            "the rig or the capture is not fit to measure with: correct what is marked bad, then"
+            " check, or capture, again"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return to_plain(self) | {"verdict": self.verdict, "seconds": round(self.seconds, 2)}
+
+    def text(self) -> str:
+        """Each check with its remedy, then what to set."""
+        lines = []
+        for check in self.checks:
+            lines.append(f"{check.verdict:<8} {check.name}: {check.sentence}")
+            if check.remedy:
+                lines.append(f"         -> {check.remedy}")
+        if self.settle_ms is not None:
+            lines.append(f"settle_ms = {self.settle_ms:g} is the value to set in the rig's file")
+        if self.exposure_ms is not None:
+            lines.append(f"exposure_ms = {self.exposure_ms:g} would be better")
+        return "\n".join([*lines, f"{self.verdict} after {self.seconds:.1f} s"])
+
+
+CLIPPED, MUCH_CLIPPED = 0.005, 0.05
+"""Shares of the illuminated pixels that are saturated: a warning, and bad."""
+WEAK, TOO_WEAK = 0.4, 0.12
+"""Of full scale, that the brightest illuminated pixels should reach: below, a warning, and bad."""
+_BRIGHTER = "Raise the exposure, or open the aperture."
+
+
+def check_capture_exposure(
+    sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
+) -> Check:
+    """Whether the frames (n, h, w) of a capture are too bright or too dark, by the pixels that see
+    the patterns."""
+    full = white_level(sequence, frames, range(len(frames)))
+    illuminated = np.logical_or.reduce([phase.illuminated for phase in phases.values()])
+    if not illuminated.any():
+        return Check("exposure", "bad", "No pixel sees the patterns.", _BRIGHTER, {})
+    rows = select_rows(*frames.shape[1:])
+    coded = [i for i, frame in enumerate(sequence.frames) if frame.kind != "texture"]
+    brightest = np.max([frames[i][rows] for i in coded], axis=0)
+    levels = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()
+    share = float(np.quantile(levels, 0.995)) / full
+    clipped = max(
+        float(np.mean(phase.reason[phase.illuminated] == Reason.SATURATED))
+        for phase in phases.values()
+    )
+    sentence = f"The brightest of the scene reaches {100 * share:.0f} % of the camera's range"
+    verdict: CheckVerdict = "good"
+    remedy = ""
+    if clipped > CLIPPED:
+        verdict = "bad" if clipped > MUCH_CLIPPED else "warning"
+        sentence = f"{100 * clipped:.1f} % of the illuminated pixels are saturated."
+        remedy = "Lower the exposure, or capture with two exposures."
+    elif share < WEAK:
+        verdict = "bad" if share < TOO_WEAK else "warning"
+        sentence, remedy = f"{sentence}.", _BRIGHTER
+    else:
+        sentence += f"; {100 * clipped:.1f} % of the pixels are saturated."
+    figures = {
+        "bright_share_of_full_scale": round(share, 3),
+        "saturated_share": round(clipped, 4),
+    }
+    return Check("exposure", verdict, sentence, remedy, figures)
+
+
+def warn_of_exposure(
+    name: str,
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    phases: Mapping[Axis, PhaseMap],
+    warn: Warn,
+) -> None:
+    """Warn, with the capture's name, where `check_capture_exposure` finds it too bright or too
+    dark."""
+    exposure = check_capture_exposure(sequence, frames, phases)
+    if exposure.verdict != "good":
+        warn(f"{name}: {exposure.sentence} {exposure.remedy}")
+
 
 VERSION = 8
 """Of the examination; results of another version are computed anew."""

@@ -14,7 +14,12 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import rigid_transform
-from slviewer.pipeline.feedback import part
+from slviewer.pipeline.cloud_corrections import (
+    describe_scale,
+    resolve_region,
+    restriction_notes,
+    scale_factor,
+)
 from slviewer.pipeline.models import (
     ModelName,
     available_models,
@@ -25,18 +30,23 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.operation import Callbacks, Job, takes_settings
+from slviewer.pipeline.operation import (
+    Callbacks,
+    SessionLike,
+    Stored,
+    list_records,
+    opened,
+    part,
+    takes_settings,
+)
 from slviewer.pipeline.reconstruct import merge_name, points_with_normals, read_merge, scan_cloud
 from slviewer.pipeline.report import report
-from slviewer.pipeline.scale import describe_scale, scale_factor
-from slviewer.pipeline.scan_edits import resolve_region, restriction_notes
-from slviewer.pipeline.stored_records import SessionLike, Stored, list_records, opened
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.kinds import RECORDS
 from slviewer.records.merge import Merge
-from slviewer.records.table import Value
+from slviewer.records.record import Value
 from slviewer.session.atomic import arriving_file, format_bytes, replace_file
 from slviewer.session.exporters import write_calibration
 from slviewer.session.mesh_files import (
@@ -485,8 +495,8 @@ def _write_shape(store: Session, name: str, target: Path, settings: ExportSettin
     progress, is_scan = settings.progress, settings.what in _SCANS
     source: Cloud | PointSet
     if is_scan:
-        job = Job(store, part(progress, 0, 0.4), settings.warn)
-        cloud = scan_cloud(job, name, settings.model, settings.accept_rejected, settings.roi)
+        job = settings.job(store).part(0, 0.4)
+        cloud = scan_cloud(job, name, settings.model, settings.roi)
         if not (mask := cloud.mask).any():
             raise InputError(
                 f"{name}: no pixel was measured: does the calibration belong to this camera and"

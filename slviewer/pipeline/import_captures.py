@@ -26,12 +26,17 @@ from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture, decode_examined, match_second
-from slviewer.pipeline.examination import examine_frames, load_or_save_examination
-from slviewer.pipeline.exposure_check import warn_of_exposure
-from slviewer.pipeline.feedback import Warn, ignore_warnings
+from slviewer.pipeline.examination import examine_frames, load_or_save_examination, warn_of_exposure
 from slviewer.pipeline.models import available_models, save_imported_stereo, trash_models
-from slviewer.pipeline.operation import Callbacks, takes_settings
-from slviewer.pipeline.stored_records import SessionLike, opened, opened_or_made
+from slviewer.pipeline.operation import (
+    Callbacks,
+    SessionLike,
+    Warn,
+    ignore_warnings,
+    opened,
+    opened_or_made,
+    takes_settings,
+)
 from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.capture import Capture, NewCapture, Role
 from slviewer.session.importers import opencv_calibration
@@ -346,7 +351,7 @@ def _known_projector_size(store: Session) -> tuple[int, int] | None:
     both are missing."""
     sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
     if not sizes and "stereo" in available_models(store):
-        meta = store.load_result("calibration/stereo", only=())[0]
+        meta = store.load_meta("calibration/stereo")
         return tuple(meta["projector"]) if meta.get("projector") else None
     return sizes.pop() if len(sizes) == 1 else None
 

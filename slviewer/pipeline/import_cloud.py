@@ -13,9 +13,15 @@ import numpy as np
 from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.vectors import box_middle, diagonal
-from slviewer.pipeline.operation import Callbacks, Findings, takes_settings
-from slviewer.pipeline.stored_records import SessionLike, opened_or_made, save_record
-from slviewer.records.reconstruction import ImportedPoints, Reconstruction
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Findings,
+    SessionLike,
+    opened_or_made,
+    save_record,
+    takes_settings,
+)
+from slviewer.records.merge import ImportedPoints, Reconstruction
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers.clouds import ReadCloud, read_cloud, unit_warning
 from slviewer.session.nominal import Units

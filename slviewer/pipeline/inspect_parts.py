@@ -28,18 +28,24 @@ from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import PointErrors
 from slviewer.pipeline.compare import fit_to_nominal
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.measure import load_feature
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, load_surface
+from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.operation import Findings, Found, Job, operation
-from slviewer.pipeline.stored_records import (
+from slviewer.pipeline.operation import (
+    Findings,
+    Found,
+    Job,
+    Progress,
     SessionLike,
     Stored,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
     list_records,
     match_names,
     next_name,
     opened,
+    operation,
+    part,
 )
 from slviewer.printable import format_csv
 from slviewer.records.inspection import (
@@ -50,7 +56,7 @@ from slviewer.records.inspection import (
     PartResult,
 )
 from slviewer.records.measurement import Measurement, Quantity
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.report.session import write_parts_page
 from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.inspection_plan import (
@@ -152,8 +158,8 @@ def _load_part(
 ) -> MeasuredSurface:
     """Load the surface of a part."""
     with opened(session) as store:
-        job, accepts = Job(store, progress, warn), settings.accept_rejected
-        return load_surface(job, scan, settings.model, accept_rejected=accepts)
+        job = Job(store, progress, warn, settings.accept_rejected)
+        return load_surface(job, scan, settings.model)
 
 
 def inspect_surfaces(
@@ -290,11 +296,8 @@ def process_capability(
     x = np.asarray(values, np.float64)
     n = len(x)
     low, high = -np.inf if lower is None else lower, np.inf if upper is None else upper
-    if (
-        n < MIN_PARTS
-        or not np.isfinite([low, high]).any()
-        or not (sigma := float(x.std(ddof=1))) > 0
-    ):
+    sigma = float(x.std(ddof=1)) if n >= MIN_PARTS else 0.0
+    if not (sigma > 0 and np.isfinite([low, high]).any()):
         return None
     mean, tail = float(x.mean()), (1 - CONFIDENCE) / 2
     cp = None

@@ -19,14 +19,32 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.geometry.rigid import move_points, rotation_angle
+from slviewer.pipeline.cloud_corrections import (
+    describe_calibration,
+    resolve_region,
+    restrict_cloud,
+    restriction_notes,
+)
 from slviewer.pipeline.cloud_record import list_outside_depths
-from slviewer.pipeline.feedback import Warn, ignore_warnings, part, stage
-from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
-from slviewer.pipeline.operation import Found, Job, operation
+from slviewer.pipeline.models import (
+    ModelName,
+    check_accepted,
+    check_calibration,
+    frame_of,
+    load_model,
+)
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
+    Warn,
+    ignore_warnings,
+    next_name,
+    operation,
+    placed_file,
+    read_record,
+    stage,
+)
 from slviewer.pipeline.reconstruct import reconstruct_captures, scan_cloud
-from slviewer.pipeline.scale import describe_calibration
-from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
-from slviewer.pipeline.stored_records import next_name, placed_file, read_record
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.merge import (
@@ -178,16 +196,15 @@ def merge(job: Job, settings: MergeSettings) -> Iterator[Found[Merge]]:
 def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     """Context manager: registered and fused scans, not stored yet; the file of the merge gets its
     place at the end."""
-    store, names, warn = job.store, settings.names, job.warn
+    job, store, names, warn = job.accepting(settings), job.store, settings.names, job.warn
     if settings.out is not None:
         Path(settings.out).parent.mkdir(parents=True, exist_ok=True)  # or it fails now
     table_deg = _list_table_angles(store, settings)
     starts = _initial_alignments(job, settings, table_deg)
-    check_accepted(store, settings.accept_rejected)
-    warn_if_stale(store, warn)
+    check_calibration(job)
     restrictions = restriction_notes(store, names, resolve_region(store, settings.roi))
     inputs = restriction_inputs(store, names, with_region=not settings.roi)
-    model, clouds = _read_clouds(replace(job, progress=part(job.progress, 0.0, 0.4)), settings)
+    model, clouds = _read_clouds(job.part(0.0, 0.4), settings)
     if settings.start == "markers" or table_deg is not None:
         markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
         if table_deg is None:
@@ -219,7 +236,7 @@ def _read_clouds(job: Job, settings: MergeSettings) -> tuple[str, dict[str, Clou
     model, clouds, region = "", dict[str, Cloud](), resolve_region(store, roi)
     if own := [n for n in names if not store.load_capture(n).is_imported_cloud]:
         fitted = load_model(store, settings.model)
-        made = reconstruct_captures(job, fitted, own, accept_rejected=settings.accept_rejected)
+        made = reconstruct_captures(job, fitted, own)
         clouds = {shot.name: restrict_cloud(store, shot.name, c, region) for shot, _, c in made}
         model = fitted.name
     return model, {n: clouds[n] if n in own else scan_cloud(job, n, roi=roi) for n in names}
@@ -470,7 +487,7 @@ def align(job: Job, settings: AlignSettings) -> Iterator[Found[Placement]]:
     places found.
     """
     store = job.store
-    check_accepted(store, settings.accept_rejected)
+    check_accepted(store, job.accept_rejected)
     names = list(settings.captures) or [
         name for name, each in list_placements(store).items() if each is None
     ]
@@ -519,13 +536,6 @@ def _align_scan(
             inputs=placed[onto].inputs | inputs,
         )
     return Placement(why=refusals[0], inputs=inputs)
-
-
-def remove_placement(store: Session, name: str) -> None:
-    """Move the placement of a scan to the trash: it is no longer shown with the others, and can be
-    aligned again."""
-    if store.has_result(f"{PLACEMENTS}/{name}"):
-        store.trash_result(f"{PLACEMENTS}/{name}")
 
 
 def list_placements(store: Session) -> dict[str, Placement | None]:

@@ -11,12 +11,23 @@ import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.fringe.layout import to_eight_bits
+from slviewer.pipeline.cloud_corrections import OFF, resolve_region, restriction_notes
 from slviewer.pipeline.export import check_export
-from slviewer.pipeline.feedback import part, stage
-from slviewer.pipeline.measured_surface import MERGED
+from slviewer.pipeline.measure import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
-from slviewer.pipeline.operation import Callbacks, Findings, Job, show_found, takes_settings
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Findings,
+    Job,
+    SessionLike,
+    load_record,
+    opened,
+    part,
+    show_found,
+    stage,
+    takes_settings,
+)
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import (
     merge_name,
@@ -24,8 +35,6 @@ from slviewer.pipeline.reconstruct import (
     read_merge,
     scan_cloud,
 )
-from slviewer.pipeline.scan_edits import OFF, resolve_region, restriction_notes
-from slviewer.pipeline.stored_records import SessionLike, load_record, opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge
 from slviewer.session.capture import Capture
@@ -159,14 +168,14 @@ def mesh(settings: MeshSettings) -> MeshResult:
         file_name = f"{'_'.join(sources).replace('/', '_')}_mesh{suffix}"
         path = store.exports / file_name if settings.out is None else Path(settings.out)
         path.parent.mkdir(parents=True, exist_ok=True)
-        before = part(progress, 0, 0.5)
+        job = settings.job(store).part(0, 0.5)
         shape: Cloud | PointSet
         if len(sources) > 1:
             merging = MergeSettings(
                 sources, sources[0], path.with_name(f"{path.stem}_points.ply"), settings.model,
                 settings.start, settings.angle, roi=settings.roi, accept_rejected=accept_rejected,
             )  # fmt: skip
-            with merge_scans(Job(store, before, warn), merging) as merged:
+            with merge_scans(job, merging) as merged:
                 shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
         elif sources[0].startswith(MERGED):
             name = merge_name(store, sources[0].removeprefix(MERGED))
@@ -174,8 +183,7 @@ def mesh(settings: MeshSettings) -> MeshResult:
             shape, restrictions = points_with_normals(points), tuple(stored.restrictions)
         else:
             warn_if_stale(store, warn)
-            job = Job(store, before, warn)
-            shape = scan_cloud(job, sources[0], settings.model, accept_rejected, settings.roi)
+            shape = scan_cloud(job, sources[0], settings.model, settings.roi)
             restrictions = restriction_notes(store, sources, resolve_region(store, settings.roi))
         if texture is not None:
             clouds, poses = _textured_scans(store, settings, shape, merged)
@@ -221,10 +229,9 @@ def _textured_scans(
     placed = {made.reference: np.eye(4)}
     placed |= {name: np.array(pair.T_reference_scan) for name, pair in made.pairs.items()}
     used = made.model or settings.model
-    job = Job(store, warn=settings.warn)
-    clouds = {  # what lies outside of the region still hides the surface from a scan
-        name: scan_cloud(job, name, used, settings.accept_rejected, OFF) for name in made.scans
-    }
+    job = Job(store, warn=settings.warn, accept_rejected=settings.accept_rejected)
+    # what lies outside of the region still hides the surface from a scan
+    clouds = {name: scan_cloud(job, name, used, OFF) for name in made.scans}
     return clouds, placed
 
 

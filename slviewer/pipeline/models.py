@@ -14,15 +14,17 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError, SessionError, SlviewerError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.operation import Found
-from slviewer.pipeline.stored_records import (
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
     SessionLike,
+    Warn,
     load_record,
     opened,
     read_record,
     save_record,
 )
+from slviewer.records.acceptance import ModelComparison
 from slviewer.records.calibration import (
     SECOND_CAMERA,
     ModelCalibration,
@@ -30,7 +32,7 @@ from slviewer.records.calibration import (
     SplinedFit,
     StereoFit,
 )
-from slviewer.records.model_comparison import ModelComparison
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
 from slviewer.session.reading import decoding
@@ -138,7 +140,7 @@ def lens_warnings(store: Session, capture: Capture) -> tuple[str, ...]:
     than for the calibration's poses."""
     if not capture.lens:
         return ()
-    inputs = store.load_result("calibration/stereo", only=())[0]["inputs"]
+    inputs = store.load_meta("calibration/stereo")["inputs"]
     names = inputs.keys() & set(store.capture_names("calibration"))
     poses = [pose for name in names if (pose := store.load_capture(name)).hash == inputs[name]]
     warnings = []
@@ -213,7 +215,7 @@ def load_stereo_if_complete(store: Session) -> StereoModel | None:
     sizes."""
     if "stereo" not in available_models(store):
         return None
-    meta = store.load_result("calibration/stereo", only=())[0]
+    meta = store.load_meta("calibration/stereo")
     sized = "model" in meta or (meta["camera"] and meta["projector"])
     sized = sized or store.captures(with_frames=True)
     return load_stereo(store) if sized else None
@@ -353,7 +355,7 @@ def _recommend(store: Session) -> tuple[str, str]:
         return compared.recommended, "recommended by the comparison on held-out poses"
     for name in ("splined", "pixelwise"):
         if name in there:
-            inputs = store.load_result(f"calibration/{name}", only=())[0]["inputs"]
+            inputs = store.load_meta(f"calibration/{name}")["inputs"]
             if len(inputs) >= POSES_FOR_PIXELWISE:
                 return name, f"made from {POSES_FOR_PIXELWISE} poses or more"
     if others := there[1:]:
@@ -408,6 +410,13 @@ def check_accepted(store: Session, accept_rejected: bool = False) -> None:
         raise CalibrationRejected(
             f"the calibration was rejected, and is not used without --accept-rejected: {reason}"
         )
+
+
+def check_calibration(job: Job) -> None:
+    """Check the calibration before clouds are made with it: `check_accepted` and
+    `warn_if_stale`."""
+    check_accepted(job.store, job.accept_rejected)
+    warn_if_stale(job.store, job.warn)
 
 
 def accept_rejected_calibration(store: Session, on: bool) -> None:
@@ -470,3 +479,20 @@ def warn_if_stale(store: Session, warn: Warn) -> None:
             f"the {' and '.join(stale)} {which} made from target poses that have since been"
             " replaced or removed: run `slviewer calibrate` again"
         )
+
+
+def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None:
+    """Save the verdict on an attempt to calibrate from these poses, whether or not it succeeded."""
+    store.save_result(
+        VERDICT, {"verdict": to_plain(verdict), "inputs": store.input_hashes(*poses)}, {}
+    )
+
+
+def load_last_verdict(store: Session) -> Verdict | None:
+    """Load the verdict on the last attempt to calibrate, also a failed one; None before the
+    first."""
+    if not store.has_result(VERDICT):
+        return None
+    return store.decode_result(
+        VERDICT, lambda meta, _: from_plain(meta["verdict"], Verdict), only=()
+    )

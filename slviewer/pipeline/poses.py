@@ -41,7 +41,7 @@ from slviewer.pipeline.capture_phases import (
 )
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.reconstruction.camera_match import Lines
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.records.verdict import Cause, Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session

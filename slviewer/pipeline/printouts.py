@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from slviewer.errors import InputError
-from slviewer.fringe.presets import PRESETS
+from slviewer.fringe.presets import find_preset
 from slviewer.fringe.sequence import parse_size
 from slviewer.session.exporters import write_pattern_folder
 from slviewer.target.board import Board
@@ -21,9 +20,7 @@ def patterns(preset: str, projector: str, out: Path | str) -> str:
 
     Returns how many images were written, in words.
     """
-    if preset not in PRESETS:
-        raise InputError(f"no pattern sequence is called {preset!r}: use {', '.join(PRESETS)}")
-    sequence = PRESETS[preset](parse_size(projector))
+    sequence = find_preset(preset)(parse_size(projector))
     write_pattern_folder(Path(out), sequence)
     return f"{len(sequence.frames)} patterns written to {out}"
 

@@ -16,12 +16,18 @@ from slviewer.evaluation.fit import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
+from slviewer.pipeline.cloud_corrections import (
+    resolve_region,
+    restrict_cloud,
+    restriction_notes,
+    scale_cloud,
+    scale_factor,
+)
 from slviewer.pipeline.cloud_record import cloud_record, masked_share
-from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
     ModelName,
-    check_accepted,
+    check_calibration,
     frame_of,
     lens_warnings,
     load_model,
@@ -29,20 +35,25 @@ from slviewer.pipeline.models import (
     load_projector,
     load_stereo,
     preferred_model,
-    warn_if_stale,
 )
-from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.scale import scale_cloud, scale_factor
-from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
-from slviewer.pipeline.stored_records import is_up_to_date, load_record, numbered_names, placed_file
+from slviewer.pipeline.operation import (
+    Found,
+    Job,
+    Warn,
+    ignore_warnings,
+    is_up_to_date,
+    load_record,
+    numbered_names,
+    operation,
+    placed_file,
+)
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud, Misfit, choose_pixels, keep_pixels
 from slviewer.reconstruction.projector_fill import fill_unseen
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud, triangulate_grid
 from slviewer.reconstruction.relative_phase import resolve_phase
-from slviewer.records.merge import Merge
-from slviewer.records.reconstruction import Reconstruction
-from slviewer.records.table import render_text
+from slviewer.records.merge import Merge, Reconstruction
+from slviewer.records.record import render_text
 from slviewer.records.verification import Shape, Verification
 from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply, write_ply
@@ -122,11 +133,11 @@ def reconstruct(job: Job, settings: ReconstructSettings) -> Iterator[Found[Recon
 def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[ReconstructedCapture]:
     """Context manager: a reconstructed capture, not stored yet; its file gets its place at the
     end."""
-    store, capture, warn = job.store, settings.capture, job.warn
+    job, store, capture = job.accepting(settings), job.store, settings.capture
+    warn = job.warn
     store.load_capture(capture).require_frames("reconstruct")
-    check_accepted(store, settings.accept_rejected)
+    check_calibration(job)
     name = settings.model or preferred_model(store)
-    warn_if_stale(store, warn)
     check_capture_sizes(store, [capture])
     job.progress(0.1, "reading and decoding")
     shot, frames, decoded = next(
@@ -137,17 +148,13 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
     texture = capture_texture(shot, frames, stretch=is_pose)
     chosen = load_models(store, () if is_pose and settings.model is None else (name,))
     job.progress(0.6, "reconstructing")
-    accepts = settings.accept_rejected
     clouds = {
         n: replace(
-            capture_cloud(
-                store, m, shot, phases, axis=settings.axis, accept_rejected=accepts, warn=warn,
-                extrapolates=not is_pose,
-            ),
+            capture_cloud(job, m, shot, phases, settings.axis, extrapolates=not is_pose),
             texture=texture,
         )
         for n, m in chosen.items()
-    }  # fmt: skip
+    }
     cloud, region = clouds[name], segment_board(store, shot, texture, warn) if is_pose else None
     restrictions, board = tuple[str, ...](), tuple[str, ...]()
     if not is_pose:
@@ -305,27 +312,24 @@ def verify(
         )
         if store.is_writable and (best := preferred_model(store)) in models:
             # by its own best axis, as reconstruct
-            shot, axis, accepts = each.capture, settings.axis, settings.accept_rejected
+            shot, axis, is_pose = each.capture, settings.axis, each.capture.role == "calibration"
             fitted = load_model(store, best)
-            texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
-            cloud = capture_cloud(
-                store, fitted, shot, each.phases, axis=axis, accept_rejected=accepts,
-                extrapolates=shot.role != "calibration",
-            )  # fmt: skip
+            texture = capture_texture(shot, each.frames, stretch=is_pose)
+            quiet = replace(job, warn=ignore_warnings)  # it has warned of this capture
+            cloud = capture_cloud(quiet, fitted, shot, each.phases, axis, extrapolates=not is_pose)
             cloud = replace(cloud, texture=texture)
-            how = ReconstructSettings(name, axis=axis, accept_rejected=accepts)
+            how = ReconstructSettings(name, axis=axis, accept_rejected=job.accept_rejected)
             region = None if each.found.is_searched else each.found.region
             yield cloud_record(store, how, fitted, cloud, each.phases[cloud.axis], region)
 
 
 def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCapture]:
     """Yield the comparison of models on each capture."""
-    store, names = job.store, settings.captures
+    job, store, names = job.accepting(settings), job.store, settings.captures
     for name in names:
         store.load_capture(name).require_frames("verify")
     chosen = load_models(store, settings.models)
-    check_accepted(store, settings.accept_rejected)
-    warn_if_stale(store, job.warn)
+    check_calibration(job)
     check_capture_sizes(store, names)
     depths = settings.depth_range or load_stereo(store).depth_range_mm
     for i, (shot, frames, phases) in enumerate(
@@ -333,11 +337,9 @@ def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCap
     ):
         job.progress(i / len(names), f"measuring {shot.name}")
         # the axis is that of the first, so that all can be compared pixel by pixel
-        clouds, axis, accepts = dict[str, Cloud](), settings.axis, settings.accept_rejected
+        clouds, axis = dict[str, Cloud](), settings.axis
         for model, fitted in chosen.items():
-            clouds[model] = capture_cloud(
-                store, fitted, shot, phases, axis=axis, accept_rejected=accepts, warn=job.warn
-            )
+            clouds[model] = capture_cloud(job, fitted, shot, phases, axis)
             axis = axis or clouds[model].axis
         assert axis is not None
         phase, region = phases[axis], None
@@ -372,14 +374,12 @@ def check_capture_sizes(store: Session, names: Iterable[str]) -> None:
 
 
 def capture_cloud(
-    store: Session,
+    job: Job,
     model: Model,
     capture: Capture,
     phases: Mapping[Axis, PhaseMap],
-    *,
     axis: Axis | None = None,
-    accept_rejected: bool = False,
-    warn: Warn = ignore_warnings,
+    *,
     extrapolates: bool = False,
 ) -> Cloud:
     """Reconstruct the organised cloud of a decoded capture, with the scale of its calibration
@@ -387,20 +387,22 @@ def capture_cloud(
     is filled by the projector, where that was calibrated too.
 
     Raises InputError where capture and calibration do not belong together: by their sizes, or by
-    how far the axes of the capture miss each other, which is a warning if ``accept_rejected``.
+    how far the axes of the capture miss each other, which is a warning where the job accepts
+    a rejected calibration.
     Where they miss each other by more than noise explains, the cloud has that `Misfit`, with a
     warning.
     """
+    store = job.store
     stereo = load_stereo(store)
     check_sizes(capture.name, capture.size, capture.other_size, stereo.rig)
     calibration = model if isinstance(model, SplinedModel) else stereo
     depths = stereo.depth_range_mm
     try:
-        check = check_phases(capture.name, phases, calibration, depths, accept_rejected)
+        check = check_phases(capture.name, phases, calibration, depths, job.accept_rejected)
     except InputError as refusal:
         raise InputError(capture.name_devices(str(refusal))) from refusal
     for message in (*lens_warnings(store, capture), *check.warnings):
-        warn(capture.name_devices(message))
+        job.warn(capture.name_devices(message))
     cloud = scale_cloud(
         reconstruct_cloud(model, phases, axis=axis, extrapolates=extrapolates),
         scale_factor(store, model.name),
@@ -420,7 +422,7 @@ def capture_cloud(
     )
     cloud = fill_unseen(cloud, lit, phase.reason == Reason.UNSEEN)
     if cloud.fill and not cloud.fill.is_used and (text := cloud.fill.text()):
-        warn(f"{capture.name}: {text}")
+        job.warn(f"{capture.name}: {text}")
     return cloud
 
 
@@ -485,7 +487,6 @@ def reconstruct_captures(
     names: Sequence[str],
     doing: str = "reconstructing",
     *,
-    accept_rejected: bool = False,
     examine: bool = True,
 ) -> Iterator[tuple[Capture, np.ndarray, Cloud]]:
     """Yield captures, in order, with their frames and their textured clouds. ``doing``: how the
@@ -499,15 +500,11 @@ def reconstruct_captures(
     for i, (capture, frames, phases) in enumerate(decoded):
         job.progress(i / len(names), f"{doing} {capture.name}")
         texture = capture_texture(capture, frames, stretch=False)
-        cloud = capture_cloud(
-            store, model, capture, phases, accept_rejected=accept_rejected, warn=job.warn
-        )
+        cloud = capture_cloud(job, model, capture, phases)
         yield capture, frames, replace(cloud, texture=texture)
 
 
-def scan_cloud(
-    job: Job, name: str, model: str | None = None, accept_rejected: bool = False, roi: str = ""
-) -> Cloud:
+def scan_cloud(job: Job, name: str, model: str | None = None, roi: str = "") -> Cloud:
     """A capture's cloud: the stored one where it was imported, or is up to date and of the
     requested model, else reconstructed; without what is extrapolated, what was deleted from it,
     and what lies outside of the region ``roi``, as `resolve_region` reads it.
@@ -517,7 +514,7 @@ def scan_cloud(
     capture, fresh = store.load_capture(name), is_up_to_date(store, stored)
     if capture.is_imported_cloud and not fresh:
         raise InputError(f"the points of {name} are missing: import its file again with --force")
-    meta = store.load_result(stored, only=())[0] if fresh else {}
+    meta = store.load_meta(stored) if fresh else {}
     if meta and (capture.is_imported_cloud or model in (None, "", meta["model"])):
         names = set(meta["arrays"]) - {"phase", "modulation"}
         arrays: dict[str, Any] = store.load_result(stored, only=names)[1]
@@ -526,8 +523,7 @@ def scan_cloud(
         misfit = Misfit.pop_from(arrays)
         cloud = Cloud(axis=meta["axis"], model=meta["model"], misfit=misfit, **arrays).supported()
     else:
-        fitted, accepts = load_model(store, model), accept_rejected
-        *_, cloud = next(reconstruct_captures(job, fitted, [name], accept_rejected=accepts))
+        *_, cloud = next(reconstruct_captures(job, load_model(store, model), [name]))
     return restrict_cloud(store, name, cloud, region)
 
 

@@ -18,12 +18,12 @@ from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.errors import DamagedError, InputError, SlviewerError
 from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.cloud_corrections import describe_scale, restrict_cloud
 from slviewer.pipeline.measure import describe_measurement, section_lines
 from slviewer.pipeline.models import (
     available_models,
+    load_last_verdict,
     load_model,
     load_reprojection,
     load_residuals,
@@ -32,32 +32,30 @@ from slviewer.pipeline.models import (
     preferred_model,
     recommended_model,
 )
-from slviewer.pipeline.operation import Callbacks, takes_settings
-from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.scale import describe_scale
-from slviewer.pipeline.scan_edits import restrict_cloud
-from slviewer.pipeline.stored_records import (
+from slviewer.pipeline.operation import (
+    Callbacks,
+    Progress,
     SessionLike,
     Stored,
+    ignore_progress,
     list_records,
     load_arrays,
     load_record,
     match_names,
     name_records,
     opened,
+    takes_settings,
 )
+from slviewer.pipeline.poses import load_observations
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals
-from slviewer.records.acceptance import AcceptanceTest
+from slviewer.records.acceptance import AcceptanceTest, Drift
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.drift import Drift
 from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
-from slviewer.records.merge import Merge
-from slviewer.records.reconstruction import Reconstruction
-from slviewer.records.record import Record
-from slviewer.records.table import format_count
+from slviewer.records.merge import Merge, Reconstruction
+from slviewer.records.record import Record, format_count
 from slviewer.records.verification import Verification
 from slviewer.report.maps import PixelCurve, verification_maps
 from slviewer.report.page import Figure, write_page
@@ -429,7 +427,7 @@ def _describe_calibration(store: Session, name: str) -> list[str]:
     """One model of the session's calibration, by name: what it was made from, its state, its
     accuracy."""
     state = store.state_of(f"calibration/{name}")
-    meta = store.load_result(f"calibration/{name}", only=())[0]
+    meta = store.load_meta(f"calibration/{name}")
     mark = ", the default" if name == preferred_model(store) else ""
     if "imported" not in meta:
         lines = [f"calibration {name}: from {len(meta['inputs'])} poses, {state}{mark}"]

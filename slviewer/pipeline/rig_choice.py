@@ -31,8 +31,8 @@ from slviewer.devices.simulated_dlpc350 import simulated_lightcrafter_rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import check_imported_capture, find_captures
+from slviewer.pipeline.operation import ignore_warnings
 from slviewer.session.capture import Capture
 from slviewer.session.importers.imported import ImportableRecording
 from slviewer.session.layout import is_session
@@ -176,6 +176,20 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
         rig=replace(bench.rig, settle_ms=settle_ms, turntable=table),
         focal_px=bench.focal_px or choice.get("focal_px"),
     )
+
+
+def place_object(bench: RigSetup) -> None:
+    """Let the stone stand on the turntable before a simulated rig, where a board, plate or ball
+    shows nothing."""
+    if bench.world is not None and bench.world.standing in ("board", "plane", "sphere"):
+        bench.world.place("stone")
+
+
+def require_turntable(rig: Rig) -> Turntable:
+    """Return the rig's turntable. Raises InputError where it has none."""
+    if rig.turntable is None:
+        raise InputError(f"the rig {rig.name} has no turntable: add [turntable] to its file")
+    return rig.turntable
 
 
 def _make_device(part: str, chosen: Choice, **provided: Any) -> Any:

@@ -11,9 +11,9 @@ from slviewer.pipeline.edit import edit_scan, set_region
 from slviewer.pipeline.export import export
 from slviewer.pipeline.merge import align, merge
 from slviewer.pipeline.mesh import mesh
+from slviewer.pipeline.operation import load_arrays
 from slviewer.pipeline.reconstruct import reconstruct, verify
 from slviewer.pipeline.report import inspect, report
-from slviewer.pipeline.stored_records import load_arrays
 from slviewer.session.store import Session
 
 

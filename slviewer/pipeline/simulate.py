@@ -11,8 +11,8 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import compute_ahead
-from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.operation import Progress, ignore_progress
 from slviewer.session.capture import NewCapture
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session

@@ -18,7 +18,7 @@ from slviewer.fringe.limits import DARK_LEVELS
 from slviewer.fringe.plateau import find_plateau
 from slviewer.fringe.reference import dark_sigmas, phase_shift
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.operation import Progress, ignore_progress
 
 MAX_SUGGESTED = 4
 BUDGET_S = 20.0
@@ -133,14 +133,6 @@ def suggest_exposure(
         return bracket.choose(current_ms or (before.exposure_ms,), before.gain)
     finally:
         rig.camera.apply(before)
-
-
-def apply_suggestion(rig: Rig, suggestion: ExposureSuggestion) -> list[float]:
-    """Set the camera as suggested. Returns the exposures of each capture where they are several,
-    else none."""
-    exposures = list(suggestion.exposures_ms)
-    rig.camera.apply(CameraSettings(exposures[0], suggestion.gain))
-    return exposures if len(exposures) > 1 else []
 
 
 @dataclass(eq=False)

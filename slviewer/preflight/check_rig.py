@@ -10,10 +10,17 @@ from slviewer.devices.capture import can_burst
 from slviewer.devices.protocols import CameraSettings, Rig, report_driver_faults
 from slviewer.errors import DeviceError
 from slviewer.pipeline.capture import RigSettings, set_camera
-from slviewer.pipeline.check_results import Check, CheckName, Preflight
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
+from slviewer.pipeline.examination import Check, CheckName, Preflight
+from slviewer.pipeline.operation import (
+    Progress,
+    SessionLike,
+    Warn,
+    ignore_progress,
+    ignore_warnings,
+    opened,
+    part,
+)
 from slviewer.pipeline.rig_choice import RigLike, SetUp, load_rig, set_up
-from slviewer.pipeline.stored_records import SessionLike, opened
 from slviewer.preflight.latency import measure_latency
 from slviewer.preflight.light import (
     capture_burst,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.pipeline.check_results import Check, CheckVerdict
+from slviewer.pipeline.examination import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CHANGE_COUNT = 8

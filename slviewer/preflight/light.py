@@ -10,8 +10,7 @@ from slviewer.fringe.response import (
     measure_nonlinearity,
     predict_phase_error,
 )
-from slviewer.pipeline.check_results import Check, CheckVerdict
-from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
+from slviewer.pipeline.examination import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK, Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _BURST = 24

@@ -11,7 +11,7 @@ from slviewer.errors import DeviceError
 from slviewer.examination.examine import examine
 from slviewer.fringe.presets import bits_for, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, Kind, PatternSequence
-from slviewer.pipeline.check_results import Check, CheckVerdict
+from slviewer.pipeline.examination import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
 from slviewer.records.verdict import ORDER_CAUSES, Examination
 

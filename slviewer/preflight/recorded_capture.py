@@ -16,10 +16,16 @@ from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.response import measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
-from slviewer.pipeline.check_results import Check, CheckName, CheckVerdict, Preflight
-from slviewer.pipeline.examination import examine_frames, name_frames
-from slviewer.pipeline.exposure_check import check_capture_exposure
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.examination import (
+    Check,
+    CheckName,
+    CheckVerdict,
+    Preflight,
+    check_capture_exposure,
+    examine_frames,
+    name_frames,
+)
+from slviewer.pipeline.operation import Progress, ignore_progress, part
 from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import (
     MISPLACING_CAUSES,

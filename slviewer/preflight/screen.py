@@ -7,7 +7,7 @@ from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.check_results import Check
+from slviewer.pipeline.examination import Check
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CODE = (1, 0, 1, 1, 0, 0, 1, 0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slviewer.pipeline.check_results import Check
+from slviewer.pipeline.examination import Check
 from slviewer.preflight.light import Burst
 from slviewer.preflight.rig_under_test import RigUnderTest
 

@@ -2,7 +2,7 @@
 
 from slviewer.devices.protocols import Turntable, report_driver_faults
 from slviewer.errors import DeviceError, InputError
-from slviewer.pipeline.check_results import Check
+from slviewer.pipeline.examination import Check
 
 _TURN_DEG = 2.0
 _TOLERANCE_DEG = 0.2

@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rigid import Floats, Floats32, Mask
-from slviewer.records.reconstruction import ProjectorFill
+from slviewer.records.merge import ProjectorFill
 
 Points = np.ndarray
 """Of an organised cloud (h, w, 3), or some of its points (n, 3), mm; or directions there."""

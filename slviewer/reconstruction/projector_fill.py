@@ -18,7 +18,7 @@ import numpy as np
 from slviewer.geometry.rigid import Mask
 from slviewer.geometry.vectors import rms
 from slviewer.reconstruction.cloud import Cloud, Map, number_tiles
-from slviewer.records.reconstruction import ProjectorFill
+from slviewer.records.merge import ProjectorFill
 
 TILES = (5, 6)
 """Rows and columns of tiles of what the cloud covers: a projector that turned is off in all of

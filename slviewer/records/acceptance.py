@@ -1,13 +1,25 @@
-"""Tests of a calibration with certified artefacts, against the operator's limits."""
+"""Tests of a calibration: with certified artefacts, against the operator's limits; by a later
+capture of its board; and on target poses that it was not made from."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from math import hypot
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from slviewer.records.record import Count, Record, list_shares
-from slviewer.records.table import Cell, Column, Mark, Table, format_scale, format_signed
+from slviewer.records.record import (
+    Cell,
+    Column,
+    Count,
+    Mark,
+    Meta,
+    Record,
+    Table,
+    Vector,
+    format_scale,
+    format_signed,
+    list_shares,
+)
 
 Decision = Literal["pass", "fail", "undecided"]
 Interval = tuple[float, float]
@@ -173,10 +185,11 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     test, ``scale_applied`` the one that it put in force; ``time``: ISO 8601, UTC.
     """
 
-    kind: ClassVar[str] = "acceptance"
-    title: ClassVar[str] = "Acceptance"
-    is_history: ClassVar[bool] = True
-    newest_first: ClassVar[bool] = True
+    kind = "acceptance"
+    title = "Acceptance"
+    has_figures = False  # repeated, the test would find a scale that was corrected since
+    is_history = True
+    newest_first = True
     artefact: CertifiedArtefact
     model: str
     positions: list[PositionErrors]
@@ -191,7 +204,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     time: str = ""
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Convert a record of version 0.2, whose figures were one entry."""
         if not isinstance(old := meta.get("accepted"), dict):
             return meta
@@ -210,10 +223,6 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
             f" {self.model} on {self.time[:10]}:"
             f" {(self.decision or 'not decided').upper()}{missing}"
         )
-
-    def figures(self) -> dict[str, float]:
-        """Return none: repeated, the test would find a scale that was corrected since."""
-        return {}
 
     def list_tables(self, name: str) -> list[Table]:
         """Return the properties, the positions, and the budget of a length."""
@@ -288,3 +297,212 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
                 " accuracy."
             )
         return notes
+
+
+DriftVerdict = Literal["still good", "recalibrate"]
+
+
+class Drift(Record, frozen=True, kw_only=True):
+    """One board against the saved calibration: whether the rig is still as it was.
+
+    Sigmas are standard deviations. ``turn_mrad``, ``shift_mm``: estimated rotation about and
+    translation along the projector's own axes. ``scale_ppm``: apparent growth of the board;
+    ``across_px``: mean offset across the epipolar lines, None with one axis; ``misfit_px``: RMS
+    that no movement explains. ``chance``: p-value of the change if nothing moved. ``seen_alone``:
+    size in mrad and mm at which each rotation and translation would be detected with 95 %
+    probability if it were the only change. ``unseen``: descriptions of changes that would not be
+    detected. ``time``: ISO 8601, UTC.
+    """
+
+    kind = "drift"
+    title = "Drift"
+    is_history = True
+    capture: str
+    axes: tuple[Literal["x", "y"], ...]
+    verdict: DriftVerdict
+    reasons: tuple[str, ...]
+    turn_mrad: Vector
+    turn_sigma_mrad: Vector
+    shift_mm: Vector
+    shift_sigma_mm: Vector
+    baseline_mm: float
+    baseline_sigma_mm: float
+    scale_ppm: float
+    scale_sigma_ppm: float
+    across_px: float | None
+    across_sigma_px: float | None
+    misfit_px: float
+    chance: float
+    seen_alone: tuple[float, float, float, float, float, float]
+    unseen: tuple[str, ...]
+    time: str = ""
+
+    @classmethod
+    def upgrade(cls, meta: Meta) -> Meta:
+        """Convert a record of version 0.2, whose figures were one entry."""
+        if not isinstance(old := meta.get("checked"), Mapping):
+            return meta
+        settings = {"capture": old.get("capture")}
+        return {**old, "inputs": meta.get("inputs", {}), "operation": "check", "settings": settings}
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the calibration is still good."""
+        return self.verdict == "still good"
+
+    def summary(self) -> str:
+        """Return the verdict and its reasons in one sentence."""
+        because = f", because {'; '.join(self.reasons)}" if self.reasons else ""
+        return f"{self.capture}: {self.verdict}{because}"
+
+    def figures(self) -> dict[str, float]:
+        """Return the apparent growth of the board, and what no movement explains."""
+        return {"scale_ppm": self.scale_ppm, "misfit_px": self.misfit_px}
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Drift"]) -> list[Table]:  # type: ignore[override]
+        """Return a table of the checks, the latest first, and one of what the latest found of each
+        axis."""
+        rows = [
+            {
+                "check": name,
+                Column("time, UTC", detail=True): each.time[:16].replace("T", " "),
+                "capture": each.capture,
+                "answer": Cell(each.verdict, "better" if each.is_good else "worse"),
+                Column("change of scale", "ppm", digits=0): each.scale_ppm,
+                Column("±", "ppm", digits=0): each.scale_sigma_ppm,
+                Column("epipolar error", "px", digits=4): each.across_px,
+                Column("±", "px", digits=4, detail=True): each.across_sigma_px,
+                Column("misfit", "px", detail=True): each.misfit_px,
+            }
+            for name, each in reversed(list(found.items()))
+        ]
+        *_, (name, latest) = found.items()
+        return [
+            Table.of(rows, "Drift checks, the latest first").without_empty(),
+            latest._list_movements(name),
+        ]
+
+    def _list_movements(self, name: str) -> Table:
+        rows = [
+            {
+                "axis of the projector": axis,
+                Column("turn", "mrad"): self.turn_mrad[k],
+                Column("±", "mrad"): self.turn_sigma_mrad[k],
+                Column("shift", "µm", digits=0): 1e3 * self.shift_mm[k],
+                Column("±", "µm", digits=0): 1e3 * self.shift_sigma_mm[k],
+                Column("turn", "mrad", "detectable", digits=4, detail=True): self.seen_alone[k],
+                Column("shift", "µm", "detectable", digits=1, detail=True): (
+                    1e3 * self.seen_alone[3 + k]
+                ),
+            }
+            for k, axis in enumerate("xyz")
+        ]
+        baseline = 1e3 * self.baseline_mm
+        notes = [
+            f"{self.summary()}.",
+            f"Baseline {format_signed(baseline)} ± {1e3 * self.baseline_sigma_mm:.0f} µm.",
+            (
+                "A pan and a shift along x look nearly alike, as do a nod and a shift along y:"
+                " their sum is known far better than each. Detectable: if it is the only change."
+            ),
+            *(f"Not detectable: {what}." for what in self.unseen),
+        ]
+        return Table.of(rows, f"Check {name}: how the projector has moved", notes)
+
+
+class HeldOutError(msgspec.Struct, frozen=True):
+    """Errors of one model on boards that were not used to fit it, RMS where they are of several
+    poses.
+
+    ``plane_mm``: RMS distance of the board's pixels from their plane. ``board_mm``: RMS distance of
+    the features from the board laid over them, flatness, shape and scale included. ``scale_ppm``:
+    how much too long the board's own spacings come out. ``camera_px``, ``projector_px``: what
+    ``board_mm`` amounts to in the images, RMS.
+    """
+
+    plane_mm: float
+    board_mm: float
+    scale_ppm: float
+    camera_px: float
+    projector_px: float
+
+
+class HeldOutPose(HeldOutError, frozen=True):
+    """Errors of one model on one pose, from so many ``pixels``."""
+
+    pixels: Count
+    depth_mm: float
+
+
+class ModelComparison(Record, frozen=True, kw_only=True):
+    """Target poses, each measured by calibrations that were made without it, all over the same
+    pixels.
+
+    ``models``: errors over all poses, the simplest model first; ``poses``: {model: {pose: its
+    errors}}; ``folds``: poses held out together; ``failed``: {model: why it could not be fitted to
+    some fold}; ``recommended``: the model with the least error on boards, of nearly equal ones the
+    simplest.
+    """
+
+    kind = "validation"
+    title = "Comparison of models"
+    has_figures = False  # repeated, each model is fitted to each fold, which takes minutes
+    recommended: str
+    models: Annotated[dict[str, HeldOutError], msgspec.Meta(min_length=1)]
+    poses: dict[str, dict[str, HeldOutPose]]
+    folds: tuple[tuple[str, ...], ...]
+    failed: dict[str, str] = {}
+
+    @classmethod
+    def upgrade(cls, meta: Meta) -> Meta:
+        """Convert a record of version 0.2, whose figures were one entry."""
+        if not isinstance(old := meta.get("validation"), Mapping):
+            return meta
+        settings = {"models": list(old.get("models", {})), "folds": len(old.get("folds", ()))}
+        inputs = meta.get("inputs", {})
+        return {**old, "inputs": inputs, "operation": "validate", "settings": settings}
+
+    def covers(self, models: Iterable[str]) -> bool:
+        """Whether all of these models were compared."""
+        return {*self.models, *self.failed}.issuperset(models)
+
+    def summary(self) -> str:
+        """Return the error of each model on boards, and the recommended model, in one sentence."""
+        errors = ", ".join(f"{model} {each.board_mm:.3f} mm" for model, each in self.models.items())
+        return f"held-out error of the models: {errors}; {self.recommended} is recommended"
+
+    def list_tables(self, name: str) -> list[Table]:
+        """Return a table of the errors with a line for each model; the least ones are marked."""
+        columns = {
+            "plane_mm": Column("plane", "mm", digits=4),
+            "board_mm": Column("board", "mm", digits=4),
+            "scale_ppm": Column("scale", "ppm", digits=0),
+            "camera_px": Column("camera", "px"),
+            "projector_px": Column("projector", "px"),
+        }
+        least = {
+            figure: min(getattr(each, figure) for each in self.models.values())
+            for figure in ("plane_mm", "board_mm", "camera_px")
+            if len(self.models) > 1
+        }
+        rows = []
+        for model, each in self.models.items():
+            row: dict[Any, Cell] = {
+                "model": Cell(model, "strong" if model == self.recommended else "")
+            }
+            for figure, column in columns.items():
+                value = getattr(each, figure)
+                row[column] = Cell(value, "better" if value == least.get(figure) else "")
+            rows.append(row)
+        count = len(next(iter(self.poses.values())))
+        notes = [
+            (
+                f"{count} poses, each measured by calibrations without it ({len(self.folds)}"
+                " folds). Plane: distance of the board's features from their plane; board: from"
+                " their true positions."
+            ),
+            f"Recommended of these: {self.recommended}.",
+            *(f"{model} could not be compared: {why}." for model, why in self.failed.items()),
+        ]
+        return [Table.of(rows, "RMS on held-out poses", notes)]

@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from math import dist
-from typing import Any, ClassVar
+from typing import Any
 
 import msgspec
 
-from slviewer.records.record import Count, Record, Share
-from slviewer.records.table import Column, Table
+from slviewer.records.record import Column, Count, Meta, Record, Share, Table
 from slviewer.records.verdict import Finding, Verdict
 
 MIN_WEIGHT = 0.7
@@ -325,16 +324,16 @@ class ModelCalibration(Record, frozen=True, kw_only=True):
     returns.
     """
 
-    kind: ClassVar[str] = "calibration"
-    title: ClassVar[str] = "Models"
-    is_of_captures: ClassVar[bool] = False
+    kind = "calibration"
+    title = "Models"
+    is_of_captures = False
     model: dict[str, Any] = {}
     fit: StereoFit | PixelwiseFit | SplinedFit | None = None
     verdict: Verdict | None = None
     second_camera: bool = False
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Add the figures of a stereo calibration that was imported, or made by version 0.2, and
         the operation."""
         if isinstance(imported := meta.get("imported"), Mapping):

@@ -3,13 +3,11 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import msgspec
 
 from slviewer.records.acceptance import MARKS, Decision, worst_decision
-from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Row, Table, format_count
+from slviewer.records.record import Cell, Column, Count, Record, Row, Table, format_count
 
 RULE = (
     "Decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty"
@@ -90,9 +88,9 @@ class Inspection(Record, frozen=True, kw_only=True):
     aligned; without, places are in the camera's frame.
     """
 
-    kind: ClassVar[str] = "inspection"
-    title: ClassVar[str] = "Inspection"
-    newest_first: ClassVar[bool] = True
+    kind = "inspection"
+    title = "Inspection"
+    newest_first = True
     plan: str
     characteristic: tuple[Characteristic, ...]
     parts: tuple[PartResult, ...]

@@ -3,12 +3,9 @@
 from slviewer.records import (  # noqa: F401, each registers its own
     acceptance,
     calibration,
-    drift,
     inspection,
     measurement,
     merge,
-    model_comparison,
-    reconstruction,
     verification,
 )
 from slviewer.records.record import RECORDS

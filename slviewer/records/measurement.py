@@ -3,16 +3,24 @@ nominal models; and a measured number with its unit and uncertainty."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.records.acceptance import COVERAGE, MARKS, Decision
-from slviewer.records.plain import from_plain
-from slviewer.records.record import Count, Matrix4, Record, Vector
-from slviewer.records.table import Cell, Column, Table
+from slviewer.records.record import (
+    Cell,
+    Column,
+    Count,
+    Matrix4,
+    Meta,
+    Record,
+    Table,
+    Vector,
+    from_plain,
+)
 
 Unit = Literal["mm", "deg", "mm²", "%", ""]
 
@@ -270,10 +278,10 @@ class Measurement(Record, frozen=True, kw_only=True):
     that were not measured, ``counts`` of all points between ``edges`` mm.
     """
 
-    kind: ClassVar[str] = "measurements"
-    title: ClassVar[str] = "Measurements"
-    prefix: ClassVar[str] = "m"
-    labels: ClassVar[str] = "measurement names"
+    kind = "measurements"
+    title = "Measurements"
+    prefix = "m"
+    labels = "measurement names"
     what: What
     source: str
     model: str
@@ -290,7 +298,7 @@ class Measurement(Record, frozen=True, kw_only=True):
     warnings: tuple[str, ...] = ()
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Convert a measurement of version 0.2, whose figures were in its ``data``."""
         if "data" not in meta:
             return meta

@@ -6,13 +6,24 @@ from collections.abc import Iterable, Mapping
 from itertools import combinations
 from math import dist
 from statistics import fmean
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from slviewer.records.plain import to_plain
-from slviewer.records.record import Count, Record, Vector, list_numbers, list_shares
-from slviewer.records.table import Cell, Column, Table, compare_with_first, format_scale
+from slviewer.records.record import (
+    Cell,
+    Column,
+    Count,
+    Meta,
+    Record,
+    Table,
+    Vector,
+    compare_with_first,
+    format_scale,
+    list_numbers,
+    list_shares,
+    to_plain,
+)
 
 Shape = Literal["plane", "sphere"]
 MAX_EXCLUDED = 0.02
@@ -49,8 +60,8 @@ class Verification(Record, frozen=True, kw_only=True):
     lie in it.
     """
 
-    kind: ClassVar[str] = "verify"
-    title: ClassVar[str] = "Verification"
+    kind = "verify"
+    title = "Verification"
     shape: Shape
     models: Annotated[dict[str, ModelFit], msgspec.Meta(min_length=1)]
     incidence: dict[str, float] | None = None
@@ -59,7 +70,7 @@ class Verification(Record, frozen=True, kw_only=True):
     warnings: tuple[str, ...] = ()
 
     @classmethod
-    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    def upgrade(cls, meta: Meta) -> Meta:
         """Convert a record of version 0.2, whose models' entries were spread over the record."""
         if not {"centres_mm", "models", "shape"} <= meta.keys():
             return meta

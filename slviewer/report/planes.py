@@ -11,7 +11,7 @@ import numpy as np
 from slviewer.evaluation.letter import find_pose
 from slviewer.records.record import DEPTHS
 from slviewer.records.verification import Verification
-from slviewer.report.canvas import (
+from slviewer.report.page import (
     BAND,
     FULL,
     INK,
@@ -19,6 +19,7 @@ from slviewer.report.canvas import (
     SMALL_PT,
     SOFT,
     TITLE_PT,
+    Figure,
     add_legend,
     add_legend_above,
     finish_figure,
@@ -28,7 +29,6 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.page import Figure
 
 
 def rms_bars(found: Mapping[str, Verification]) -> Figure:

@@ -11,7 +11,7 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation import letter
 from slviewer.records.merge import Merge
-from slviewer.records.table import (
+from slviewer.records.record import (
     Cell,
     Column,
     Rows,
@@ -22,7 +22,6 @@ from slviewer.records.table import (
     format_signed,
 )
 from slviewer.records.verification import Verification, average, list_fits
-from slviewer.report.canvas import HALF, percentile
 from slviewer.report.maps import (
     PixelCurve,
     error_limit,
@@ -30,7 +29,7 @@ from slviewer.report.maps import (
     rms_maps,
     verification_maps,
 )
-from slviewer.report.page import Headline, Item, PageNotice, Section
+from slviewer.report.page import HALF, Headline, Item, PageNotice, Section, percentile
 from slviewer.report.planes import planes_in_space, rms_bars
 from slviewer.report.surfaces import draw_clouds, draw_merged_cloud
 from slviewer.surface.fuse import Fused

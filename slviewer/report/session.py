@@ -13,29 +13,37 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
-from slviewer.records.acceptance import MARKS, AcceptanceTest, Decision, worst_decision
+from slviewer.records.acceptance import (
+    MARKS,
+    AcceptanceTest,
+    Decision,
+    Drift,
+    ModelComparison,
+    worst_decision,
+)
 from slviewer.records.calibration import ModelCalibration, Reprojection
-from slviewer.records.drift import Drift
 from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
 from slviewer.records.measurement import Measurement
-from slviewer.records.merge import Merge
-from slviewer.records.model_comparison import ModelComparison
-from slviewer.records.reconstruction import Reconstruction
-from slviewer.records.record import Record
-from slviewer.records.table import Cell, Column, Mark, Table, Value, format_count, relabel
+from slviewer.records.merge import Merge, Reconstruction
+from slviewer.records.record import Cell, Column, Mark, Record, Table, Value, format_count, relabel
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, average
-from slviewer.report.canvas import (
+from slviewer.report.maps import coverage, pose_bars, residual_arrows, rms_maps
+from slviewer.report.page import (
     HALF,
     INK,
     SOFT,
+    Figure,
+    Headline,
+    Item,
+    PageNotice,
+    Section,
+    TitlePage,
     finish_figure,
     new_figure,
     style_axes,
+    write_page,
 )
-from slviewer.report.maps import rms_maps
-from slviewer.report.page import Figure, Headline, Item, PageNotice, Section, TitlePage, write_page
-from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
 from slviewer.session.capture import Capture
 from slviewer.session.report_details import ReportDetails
 

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.records.measurement import NominalDeviation
-from slviewer.report.canvas import (
+from slviewer.report.page import (
     DENSITY,
     FULL,
     HALF,
     INK,
     SOFT,
     TEXT_PT,
+    Figure,
     add_colour_bar,
     add_legend,
     finish_figure,
@@ -26,7 +27,6 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.page import Figure
 from slviewer.surface.fuse import Fused
 
 LIGHT = np.array([-0.45, -0.36, -0.82]) / np.linalg.norm([-0.45, -0.36, -0.82])
@@ -276,7 +276,8 @@ def _format_count(points: np.ndarray) -> str:
 
 
 Lines = Sequence[NDArray[np.floating]]
-PICTURE = (560, 420)
+DEVIATION_PICTURE = (DENSITY * 560, DENSITY * 420)
+"""Width and height of the picture of a deviation, px."""
 LINE = "#2270b8"
 TOLERANCE = "#b3261e"
 CURSOR_COLOURS = ("#b3261e", "#1f9673", "#7b5cc4")
@@ -368,7 +369,6 @@ def draw_deviation(
     palette = ListedColormap(deviation_colours(np.linspace(-1, 1, 255), 1.0) / 255)
     drawing = new_figure(FULL, 480)
     left, right = drawing.subplots(1, 2, width_ratios=(1.35, 1))
-    width, height = PICTURE
     points = np.concatenate([arrays["points"], arrays["uncovered"]]).astype(np.float64)
     normals = np.concatenate([arrays["normals"], np.full(arrays["uncovered"].shape, np.nan)])
     grey = np.broadcast_to(np.array(EXCLUDED_COLOUR, np.uint8), arrays["uncovered"].shape)
@@ -379,7 +379,7 @@ def draw_deviation(
             points,
             normals,
             colours,
-            (DENSITY * width, DENSITY * height),
+            DEVIATION_PICTURE,
             view_rotation(12.0, 10.0),
         )
     )

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from slviewer.errors import DamagedError, SessionError
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.session.reading import decoding, read_json
 
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|done|new)-\d+-[0-9a-f]+")

@@ -15,7 +15,7 @@ from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks,
 from slviewer.fringe.layout import lowest_white, sample_phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.calibration import SECOND_CAMERA
-from slviewer.records.plain import from_plain
+from slviewer.records.record import from_plain
 from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.reading import MOST_REMEMBERED, decoding, identify, read_json
 from slviewer.session.results import Exposure, Size, digest_bytes

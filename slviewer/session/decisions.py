@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, TypedDict
 import msgspec
 
 from slviewer.errors import DamagedError, InputError
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.names import natural_key, new_name
 from slviewer.session.reading import read_json

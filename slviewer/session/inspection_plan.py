@@ -13,8 +13,7 @@ from slviewer.inspection.features import MEANINGS, Feature
 from slviewer.inspection.regions import Region
 from slviewer.records.inspection import Characteristic
 from slviewer.records.measurement import LEAST_AREA
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.record import Matrix4, Vector
+from slviewer.records.record import Matrix4, Vector, from_plain, to_plain
 from slviewer.session.atomic import replace_file
 from slviewer.session.reading import read_toml
 from slviewer.session.toml import table_lines

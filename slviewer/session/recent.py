@@ -10,7 +10,7 @@ import msgspec
 import platformdirs
 
 from slviewer.errors import DamagedError, InputError, SessionError
-from slviewer.records.plain import from_plain
+from slviewer.records.record import from_plain
 from slviewer.session import atomic
 from slviewer.session.layout import is_session, trash_place
 from slviewer.session.reading import read_json

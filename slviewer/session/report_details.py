@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 
 from slviewer.errors import InputError
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.session.names import clean_label
 
 FIELDS = {

@@ -20,8 +20,7 @@ import numpy as np
 
 from slviewer.errors import DamagedError, InputError
 from slviewer.records.kinds import RECORDS
-from slviewer.records.plain import from_plain
-from slviewer.records.record import Count, Vector
+from slviewer.records.record import Count, Vector, from_plain
 from slviewer.records.verdict import Examination
 from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.layout import inner_folders

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.results import digest_bytes
 from slviewer.session.store import Session
@@ -127,7 +127,7 @@ def restriction_inputs(
 def _load_meta(store: Session, scan: str) -> dict[str, Any]:
     """Return the stored edits of a scan, without pixels; empty where it has none."""
     name = f"{FOLDER}/{scan}"
-    return store.load_result(name, only=())[0] if store.has_result(name) else {}
+    return store.load_meta(name) if store.has_result(name) else {}
 
 
 def _read_edit(entry: dict[str, Any], packed: np.ndarray | None, size: tuple[int, int]) -> Edit:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SessionError
-from slviewer.records.plain import from_plain
+from slviewer.records.record import from_plain
 from slviewer.session.atomic import write_bytes
 from slviewer.session.reading import decoding, read_json
 from slviewer.session.results import Extent, digest_bytes, in_threads

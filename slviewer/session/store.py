@@ -79,11 +79,9 @@ class Session(Decisions):
 
     @classmethod
     def open(cls, path: str | Path, write: bool = False) -> Self:
-        """Open an existing session, for reading, or for writing by this process alone.
-
-        Raises SessionError where there is no session, where it is damaged or of a newer schema, or
-        where another process is writing to it.
-        """
+        """Open an existing session, for reading, or for writing by this process alone. Raises
+        SessionError where there is no session, where it is damaged or of a newer schema, or where
+        another process is writing to it."""
         folder = layout.session_folder(path)
         session = cls(folder, WriterLock(folder) if write else None)
         try:
@@ -407,13 +405,15 @@ class Session(Decisions):
         else:
             self._together.replace(target, staged, old_to)
 
+    def load_meta(self, name: str) -> dict[str, Any]:
+        """The `meta` of a result, without its arrays; raises as `load_result`."""
+        return self.load_result(name, only=())[0]
+
     def load_result(
         self, name: str, only: Collection[str] | None = None
     ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """`meta` as saved with its content `hash`, and the arrays (those named in `only`).
-
-        Raises InputError where there is no such result, SessionError where it is damaged.
-        """
+        """`meta` as saved with its content `hash`, and the arrays (those named in `only`). Raises
+        InputError where there is no such result, SessionError where it is damaged."""
         folder = self._result_folder(name)
         if not (folder / "meta.json").is_file():
             there = ", ".join(self.result_names()) or "none"

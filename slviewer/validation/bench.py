@@ -24,14 +24,13 @@ from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.geometry.jit import run_rows
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.models import load_model, load_stereo
+from slviewer.pipeline.operation import Progress, ignore_progress, opened, part
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, simulate
-from slviewer.pipeline.stored_records import opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.onepass import OnePass
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.session import atomic
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session

@@ -14,7 +14,7 @@ from slviewer.examination.examine import examine
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.session import atomic

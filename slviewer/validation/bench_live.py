@@ -22,7 +22,7 @@ from websockets.sync.connection import Connection
 
 from slviewer.errors import SlviewerError
 from slviewer.gui.app import App
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.operation import Progress, ignore_progress
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.server.secure import SafeServer, Serving
 from slviewer.session.store import Session

@@ -19,7 +19,7 @@ from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
 from slviewer.pipeline.batch import batch
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Starts, register_all

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.geometry.jit_prepare import Preparation
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.records.verification import Verification
 from slviewer.validation.bench_rows import Row, median, row, run_python

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from slviewer.evaluation.render import Row, render
-from slviewer.pipeline.feedback import Progress, part
-from slviewer.records.plain import to_plain
+from slviewer.pipeline.operation import Progress, part
+from slviewer.records.record import to_plain
 
 T = TypeVar("T")
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.operation import Progress, ignore_progress, part
 from slviewer.validation.proof import Proof
 from slviewer.validation.prove_accuracy import prove_accuracy, prove_uncertainty
 from slviewer.validation.prove_cameras import prove_cameras

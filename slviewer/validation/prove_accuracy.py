@@ -35,7 +35,7 @@ from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.vectors import rms
-from slviewer.pipeline.feedback import Progress, part
+from slviewer.pipeline.operation import Progress, part
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.records.verification import Shape

@@ -18,7 +18,7 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.shapes import fit_plane
 from slviewer.geometry.vectors import rms
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, part
+from slviewer.pipeline.operation import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.camera_match import epipolar_lines, match_cameras
 from slviewer.reconstruction.projector_fill import fill_unseen

@@ -18,9 +18,8 @@ from slviewer.errors import InputError
 from slviewer.evaluation.render import Row
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
-from slviewer.pipeline.examination import examine_frames
-from slviewer.pipeline.exposure_check import check_capture_exposure
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.examination import check_capture_exposure, examine_frames
+from slviewer.pipeline.operation import Progress
 from slviewer.validation.capture_faults import CAPTURE_FAULTS, FaultyCapture, draw_faulty
 from slviewer.validation.proof import BandCheck, Proof, prove_checks
 from slviewer.validation.simulated_capture import (

@@ -25,7 +25,7 @@ from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.vectors import box_middle
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.poses import DecodedPose, Judged, read_pose
 from slviewer.records.verdict import Cause
 from slviewer.simulation.boards import FLAT, BoardShape, Pose, printed_board

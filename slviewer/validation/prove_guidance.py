@@ -18,7 +18,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.rigid import move_points
 from slviewer.geometry.shapes import fit_plane
 from slviewer.geometry.vectors import box_middle, rms
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.plans import planes, rotation, target_poses

@@ -27,11 +27,10 @@ from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.geometry.vectors import rms
-from slviewer.pipeline.calibrate import CalibrateSettings, calibrate, load_last_verdict
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.import_captures import import_captures
-from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.models import ModelName, load_last_verdict
+from slviewer.pipeline.operation import Job, Progress, ignore_progress
 from slviewer.pipeline.reconstruct import (
     ReconstructSettings,
     VerifySettings,

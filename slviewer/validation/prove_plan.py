@@ -20,7 +20,7 @@ from slviewer.inspection.form import (
     position_error,
     profile_error,
 )
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.records.measurement import Quantity
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 

@@ -19,7 +19,7 @@ from slviewer.fringe.decode import texture
 from slviewer.geometry.rigid import fit_rigid, move_points, rotation_angle
 from slviewer.inspection.deviation import deviation
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, part, stage
+from slviewer.pipeline.operation import Progress, part, stage
 from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct_cloud

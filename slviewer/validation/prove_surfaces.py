@@ -18,7 +18,7 @@ from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.vectors import box_middle, rms
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud
 from slviewer.simulation.boards import BoardScene, Pose, printed_board
 from slviewer.simulation.concave import Indirect, bowl, groove, wax

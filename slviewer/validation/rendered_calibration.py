@@ -11,7 +11,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig

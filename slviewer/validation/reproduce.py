@@ -17,16 +17,14 @@ from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.fit import Comparison
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
 from slviewer.pipeline.models import load_model, load_stereo
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operation import Job, Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
-from slviewer.records.plain import to_plain
-from slviewer.records.table import Column, Row, Table, render_text
+from slviewer.records.record import Column, Row, Table, render_text, to_plain
 from slviewer.records.verification import Shape, Verification, average, centre_distances_mm
 from slviewer.report.page import write_page
 from slviewer.report.reproduction import (

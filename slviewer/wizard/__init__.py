@@ -6,13 +6,13 @@ threads do the work.
 ====================  ==============================================================================
 `*_requests`          the requests, grouped by topic: methods of the state, which turn what they
                       raise into notices
-`engine`              the state behind them, and what a new snapshot requires
-`undo_history`        what was done last and can be undone, and the steps that take it back
+`engine`              the state behind them, what a new snapshot requires, and what was done last
+                      and can be undone
 `service`             what the threads of the following have in common, and their timing
 `acquisition`         one thread that owns camera and projector, and never computes
 `preview_watcher`     analyses the latest preview frame: board, brightness, stillness
 `jobs`                one worker that computes, one job after the other; each can be cancelled
-                      within a second
+                      within a second; and the notices for the operator
 `session_reader`      reads poses, calibration and records from the session's files
 `pose_plan`           computes where the board should be held next
 `steps`               the nine steps, and what each is waiting for

@@ -29,8 +29,8 @@ from slviewer.devices.protocols import (
 from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.cuda_device import allocate_frames
-from slviewer.pipeline.feedback import Progress
-from slviewer.wizard.notices import Notices, describe_failure
+from slviewer.pipeline.operation import Progress
+from slviewer.wizard.jobs import Notices, describe_failure
 from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import CaptureProgress, RigView
 

@@ -103,9 +103,11 @@ class Autopilot(Service):
         """Capture a simulated plane and a simulated sphere."""
         operator = self._operator
         self._place("plane", planes()[PLANE])
-        self._perform_act("Capturing a plane", operator.capture_plane, "A flat plate")
+        self._perform_act("Capturing a plane", operator.capture_scan, "A flat plate", "plane")
         self._place("sphere", spheres()[SPHERE])
-        self._perform_act("Capturing a sphere", operator.capture_sphere, "A sphere of 196 mm")
+        self._perform_act(
+            "Capturing a sphere", operator.capture_scan, "A sphere of 196 mm", "sphere"
+        )
 
     def _scan(self) -> None:
         """Scan the simulated object at three distances, and merge the scans."""

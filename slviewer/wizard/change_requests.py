@@ -10,8 +10,7 @@ from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, step_histo
 from slviewer.pipeline.measure import rename_measurement, restore_measurement
 from slviewer.pipeline.merge import PLACEMENTS
 from slviewer.pipeline.models import available_models
-from slviewer.pipeline.operation import Findings, Job
-from slviewer.pipeline.stored_records import load_stored
+from slviewer.pipeline.operation import Findings, Job, load_stored
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Merge
 from slviewer.session.names import clean_label
@@ -19,17 +18,18 @@ from slviewer.session.scan_edits import load_edits, load_region, save_region
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import Edit, select_support
-from slviewer.wizard.engine import Engine, request
-from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
-from slviewer.wizard.undo_history import (
+from slviewer.wizard.engine import (
+    Engine,
     Step,
     combine,
     decide_step,
     edit_step,
     move_step,
+    request,
     restore_step,
     trash_step,
 )
+from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
 
 _RESULTS_OF_CAPTURE = ("poses", "clouds", "verify", "trust", PLACEMENTS)
 
@@ -54,6 +54,10 @@ class ChangeRequests(Engine):
         store = self._store
         self._add_change(store, name, step())
 
+    def _decide(self, name: str, what: str, change: Callable[[], object]) -> None:
+        """Make a change of a decision of the session that can be undone, of this name."""
+        self._make(name, decide_step(self._store, what, change))
+
     def _finish(self, verb: str) -> Callable[[Findings[Any]], None]:
         """Return what adds the records that an operation made, numbered ones, to what can be
         undone, named after the verb."""
@@ -76,16 +80,14 @@ class ChangeRequests(Engine):
     @request("Excluding the pose")
     def exclude(self, name: str, why: str = "by hand") -> None:
         """Exclude a capture from calibrations from now on, with the reason."""
-        store = self._store
-        change = partial(store.exclude, name, why)
-        self._make(f"exclude {self._label(name)}", decide_step(store, "excluded", change))
+        change = partial(self._store.exclude, name, why)
+        self._decide(f"exclude {self._label(name)}", "excluded", change)
 
     @request("Including the pose")
     def include(self, name: str) -> None:
         """Include a capture again."""
-        store = self._store
-        change = partial(store.include, name)
-        self._make(f"include {self._label(name)}", decide_step(store, "excluded", change))
+        change = partial(self._store.include, name)
+        self._decide(f"include {self._label(name)}", "excluded", change)
 
     @request("Deleting")
     def delete(self, name: str) -> None:
@@ -108,8 +110,7 @@ class ChangeRequests(Engine):
         """Set the label of a capture, any text; its files keep their name."""
         self._store.load_capture(name)
         change = partial(self._set_label, name, label)
-        title = f"rename {self._label(name)}"
-        self._make(title, decide_step(self._store, "names", change))
+        self._decide(f"rename {self._label(name)}", "names", change)
 
     def _set_label(self, name: str, label: str) -> None:
         """Store the operator's label of a capture; its name where that is blank."""
@@ -127,7 +128,7 @@ class ChangeRequests(Engine):
                 f"the session has no {name} calibration: choose one of {', '.join(models)}"
             )
         change = partial(store.decide, "model", name or None)
-        self._make(f"use {name or 'the recommended'} model", decide_step(store, "model", change))
+        self._decide(f"use {name or 'the recommended'} model", "model", change)
 
     @request("Undoing the alignment")
     def undo_alignment(self, name: str) -> None:
@@ -167,7 +168,7 @@ class ChangeRequests(Engine):
         store = self._store
         before = load_stored(store, Measurement, name).label
         change = partial(rename_measurement, store, name, label)
-        self._make(f"rename {before}", decide_step(store, Measurement.labels, change))
+        self._decide(f"rename {before}", Measurement.labels, change)
 
     @request("Deleting")
     def delete_measurement(self, name: str) -> None:
@@ -187,8 +188,7 @@ class ChangeRequests(Engine):
     @request("Setting the region")
     def set_region(self, region: RegionOfInterest, on: bool = True) -> None:
         """Make a box the session's region of interest, in effect or not."""
-        change = partial(save_region, self._store, region, on)
-        self._make("set the region", decide_step(self._store, "region", change))
+        self._save_region("set the region", region, on)
 
     @request("Switching the region")
     def switch_region(self, on: bool) -> None:
@@ -196,16 +196,17 @@ class ChangeRequests(Engine):
         region = load_region(self._store, even_if_off=True)
         if region is None:
             raise InputError("there is no region yet: take the automatic one of a scan")
-        change = partial(save_region, self._store, region, on)
-        title = f"switch the region {'on' if on else 'off'}"
-        self._make(title, decide_step(self._store, "region", change))
+        self._save_region(f"switch the region {'on' if on else 'off'}", region, on)
 
     @request("Setting the region")
     def fit_region(self, scan: str) -> None:
         """Make the box around all points of a reconstructed scan the region of interest."""
         region = RegionOfInterest.around(whole_cloud(self._store, scan).points)
-        change = partial(save_region, self._store, region)
-        self._make("set the region", decide_step(self._store, "region", change))
+        self._save_region("set the region", region)
+
+    def _save_region(self, title: str, region: RegionOfInterest, on: bool = True) -> None:
+        """Save the region of interest, in effect or not."""
+        self._decide(title, "region", partial(save_region, self._store, region, on))
 
     @request("Deleting points")
     def delete_points(self, selections: Sequence[Selection], what: str) -> None:

@@ -127,7 +127,7 @@ def _collect(job: Job, snapshot: Snapshot, log: LogKeeper) -> Iterator[tuple[str
         yield f"session/captures/{capture.name}.json", described
     for result in session.result_names():
         try:
-            described = session.load_result(result, only=())[0]
+            described = session.load_meta(result)
         except SessionError as error:
             described = {"damaged": str(error)}
         yield f"session/results/{result}.json", described

@@ -15,14 +15,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from slviewer.devices.capture import CapturedFrames, capture_with_texture
+from slviewer.devices.capture import CapturedFrames
 from slviewer.devices.protocols import Rig
 from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry import cuda_device
-from slviewer.pipeline.capture import check_space, depth_axis, save_frames
-from slviewer.pipeline.feedback import Progress, part
+from slviewer.pipeline.capture import (
+    FULL_TURN_DEG,
+    STEPS,
+    capture_sequence,
+    capture_turn,
+    check_space,
+    depth_axis,
+    missing_steps,
+    next_turn,
+    plan_turn,
+    recorded_steps,
+    save_frames,
+)
 from slviewer.pipeline.import_captures import (
     Role,
     describe_import,
@@ -30,32 +41,20 @@ from slviewer.pipeline.import_captures import (
     import_opencv_calibration,
 )
 from slviewer.pipeline.import_cloud import import_cloud
-from slviewer.pipeline.operation import Job
-from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
-from slviewer.pipeline.turn import (
-    FULL_TURN_DEG,
-    STEPS,
-    capture_turn,
-    missing_steps,
-    next_turn,
-    place_object,
-    plan_turn,
-    recorded_steps,
-    require_turntable,
-)
+from slviewer.pipeline.operation import Job, Progress, part
+from slviewer.pipeline.rig_choice import Choice, SetUp, place_object, require_turntable, set_up
 from slviewer.session import atomic
 from slviewer.session.capture import Purpose, TurnStep
 from slviewer.session.importers.archive import CLOUD_SUFFIXES, unpack, unpacked_size
 from slviewer.session.importers.clouds import FORMATS
 from slviewer.session.names import new_name, plain_name
 from slviewer.session.reading import expand_user
-from slviewer.wizard.engine import request
+from slviewer.wizard.engine import combine, decide_step, exchange_step, request
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.result_requests import ResultRequests
 from slviewer.wizard.rig_requests import RigRequests
 from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import PreviewView, Snapshot
-from slviewer.wizard.undo_history import combine, decide_step, exchange_step
 
 IMPORTING = "Importing"
 BOARD_S = 10.0
@@ -183,23 +182,20 @@ class Operator(RigRequests, ResultRequests):
         self._capture_pose(name)
 
     @request("Capturing the scan")
-    def capture_scan(self, label: str = "") -> None:
-        """Capture an object and reconstruct it; `label` is the operator's name for it, any text."""
-        self._capture_scan("scan", label)
-
-    @request("Capturing the plane")
-    def capture_plane(self, label: str = "", *, anyway: bool = False) -> None:
-        """Capture a flat plate and compare the models on it; `anyway`: also while the board is in
-        view."""
-        self._require_no_board(anyway)
-        self._capture_scan("plane", label)
-
-    @request("Capturing the sphere")
-    def capture_sphere(self, label: str = "", *, anyway: bool = False) -> None:
-        """Capture a sphere and compare the models on it; `anyway`: also while the board is in
-        view."""
-        self._require_no_board(anyway)
-        self._capture_scan("sphere", label)
+    def capture_scan(
+        self, label: str = "", purpose: Purpose = "scan", *, anyway: bool = False
+    ) -> None:
+        """Capture an object and reconstruct it, or a flat plate or a sphere, and compare the models
+        on it; these `anyway`: also while the board is in view. `label` is the operator's name for
+        it, any text."""
+        if purpose != "scan" and not anyway:
+            self._require_no_board()
+        name = self._next_name(purpose)
+        self._queue_capture(
+            name,
+            self._scan_sequence(),
+            lambda captured: self._save_scan(name, purpose, captured, label),
+        )
 
     @request("Switching hands-free capture")
     def set_hands_free(self, on: bool) -> None:
@@ -227,26 +223,17 @@ class Operator(RigRequests, ResultRequests):
 
         self._queue_capture(name, self._pose_sequence(), save)
 
-    def _require_no_board(self, anyway: bool) -> None:
-        """Raise InputError while the live image shows the board, unless it is wanted there."""
+    def _require_no_board(self) -> None:
+        """Raise InputError while the live image shows the board."""
         view, world = self._preview, self._scene
         board = view.board if view else None
         # what stands before the simulated rig may have been exchanged since the latest image
         is_there = board is not None and (world is None or world.standing == "board")
-        if board and is_there and time.monotonic() - board.time_s < BOARD_S and not anyway:
+        if board and is_there and time.monotonic() - board.time_s < BOARD_S:
             raise InputError(
                 "the board is in view, and would be measured: take it away, or choose to capture"
                 " with the board in view"
             )
-
-    def _capture_scan(self, purpose: Purpose, label: str) -> None:
-        """Queue the capture of a scan, plane or sphere."""
-        name = self._next_name(purpose)
-        self._queue_capture(
-            name,
-            self._scan_sequence(),
-            lambda captured: self._save_scan(name, purpose, captured, label),
-        )
 
     def _save_scan(
         self,
@@ -391,12 +378,7 @@ class Operator(RigRequests, ResultRequests):
 
             def capture_step(step: TurnStep, progress: Progress) -> None:
                 """Capture and save one step, and queue its reconstruction."""
-                captured = capture_with_texture(
-                    rig,
-                    sequence,
-                    exposures,
-                    progress=lambda done, n: progress(done / n, f"frame {done} of {n}"),
-                )
+                captured = capture_sequence(rig, sequence, exposures, progress)
                 self._save_scan(step.name, "scan", captured, turn_step=step)
 
             capture_turn(rig, steps, capture_step, recorded, progress, self._warner("scans"))
@@ -452,13 +434,12 @@ class Operator(RigRequests, ResultRequests):
                 )
                 folder.mkdir()
                 try:
-                    unpacking, importing = part(job.progress, 0, 0.2), part(job.progress, 0.2, 1)
+                    unpacking = part(job.progress, 0, 0.2)
                     source, warnings = unpack(archive, folder, lambda done: unpacking(done, words))
                     for warning in warnings:
                         job.warn(warning)
                     origin = {"origin": name, **options}
-                    job = replace(job, progress=importing)
-                    return self._import_unpacked(job, source, layout, role, origin)
+                    return self._import_unpacked(job.part(0.2, 1), source, layout, role, origin)
                 finally:
                     atomic.discard(staged)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Generic
 
-from slviewer.wizard.notices import describe_failure
+from slviewer.wizard.jobs import describe_failure
 from slviewer.wizard.service import Item, Service, log
 from slviewer.wizard.snapshot import Snapshot
 

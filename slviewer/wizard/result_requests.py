@@ -2,7 +2,6 @@
 results are made from."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -14,19 +13,21 @@ from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.accept import ValidateSettings, validate
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
+from slviewer.pipeline.capture import WATERTIGHT, merge_turn
 from slviewer.pipeline.compare import CompareSettings, compare
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
-from slviewer.pipeline.feedback import part
 from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
 from slviewer.pipeline.measure import (
+    MERGED,
+    MeasuredSurface,
     MeasureSettings,
+    Place,
     RelateSettings,
     export_measurements,
     measure,
     relate,
 )
 from slviewer.pipeline.measure import What as Tool
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.pipeline.merge import (
     AlignSettings,
     MergeSettings,
@@ -43,27 +44,23 @@ from slviewer.pipeline.models import (
     available_models,
     check_accepted,
 )
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operation import Job, load_record, load_stored, part
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
-from slviewer.pipeline.stored_records import load_record, load_stored
-from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.measurement import MeasuredRegion, Measurement
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import format_count
+from slviewer.records.record import format_count, from_plain, to_plain
 from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
 from slviewer.session.names import plain_name, safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
 from slviewer.session.report_details import encode_logo
-from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard.change_requests import ChangeRequests
 from slviewer.wizard.diagnostics import write_bundle
-from slviewer.wizard.engine import on_session, request
-from slviewer.wizard.notices import describe_failure
+from slviewer.wizard.engine import request
+from slviewer.wizard.jobs import describe_failure
 from slviewer.wizard.result_views import surface_to_measure
 from slviewer.wizard.session_reader import missing_for_splined
 
@@ -104,9 +101,10 @@ class ResultRequests(ChangeRequests):
         used."""
         self._run("Comparing the models", validate, ValidateSettings(), "calibration")
 
-    accept_rejected_calibration = on_session(
-        "Using the rejected calibration", accept_rejected_calibration
-    )
+    @request("Using the rejected calibration")
+    def accept_rejected_calibration(self, on: bool) -> None:
+        """Use the present calibration although it was rejected, or not."""
+        accept_rejected_calibration(self._store, on)
 
     @request("Verifying")
     def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
@@ -176,7 +174,7 @@ class ResultRequests(ChangeRequests):
         except SlviewerError as error:
             failed(error)
             return
-        self._run(MERGING, merge, settings, "merge", failed, self._finish("merge"))
+        self._run(MERGING, merge, settings, "merge", failed=failed, finish=self._finish("merge"))
 
     def _merge_turn(self, names: list[str]) -> None:
         """Queue the merge of the scans of a turn by the angles of its turntable, and a watertight
@@ -185,14 +183,11 @@ class ResultRequests(ChangeRequests):
         def work(job: Job) -> str:
             """Merge and mesh; returns a sentence about both."""
             settings = MergeSettings(names, names[0], accept_rejected=accepts_rejected(job.store))
-            merging, meshing = part(job.progress, 0, 0.7), part(job.progress, 0.7, 1)
-            found = merge_turn(job.store, settings, merging, job.warn)
+            found = merge_turn(job.store, settings, part(job.progress, 0, 0.7), job.warn)
             finish(found)
             ((number, merged),) = found.items()
             try:
-                words = _export_file(
-                    replace(job, progress=meshing), "merged-mesh", number, "ply", WATERTIGHT
-                )
+                words = _export_file(job.part(0.7, 1), "merged-mesh", number, "ply", WATERTIGHT)
             except Cancelled:
                 raise
             except SlviewerError as error:
@@ -254,27 +249,16 @@ class ResultRequests(ChangeRequests):
         if what in ("merge", "merged-mesh"):
             name = self._last_merge("there is no merge yet: merge scans first")
 
-        def write_textured(job: Job) -> str:
-            """Write a mesh with a texture; returns a sentence that begins with the file's name."""
-            source = f"{MERGED}{name}" if what == "merged-mesh" else name
-            path = store.exports / default_file_name(what, name, chosen)
-            made = mesh(
-                store, [source], path, plan=plan, texture=texture, white=white,
-                accept_rejected=accepts_rejected(store), progress=part(job.progress, 0, 0.98),
-                warn=job.warn,
-            )  # fmt: skip
-            assert made.textured is not None
-            job.progress(1.0, "exported")
-            words = made.meshed.text().splitlines()[0]
-            return f"{path.name} is ready to download: {words}; {made.textured.text()}"
+        self._work(
+            "Exporting",
+            lambda job: _export_file(job, what, name, chosen, plan, texture, white),
+            "measurements",
+        )
 
-        def write(job: Job) -> str:
-            """Write any other file, as `_export_file` does."""
-            return _export_file(job, what, name, chosen, plan)
-
-        self._work("Exporting", write if texture is None else write_textured, "measurements")
-
-    set_report_details = on_session("Changing the title page", Session.set_report_details)
+    @request("Changing the title page")
+    def set_report_details(self, **changed: Any) -> None:
+        """Set some of what the title page of reports states."""
+        self._store.set_report_details(**changed)
 
     @request("Reading the logo")
     def upload_logo(self, name: str, content: bytes) -> None:
@@ -406,7 +390,8 @@ class ResultRequests(ChangeRequests):
             """Report why, in the words of the panel."""
             self._notices.add_failure(COMPARING, _reword(error))
 
-        self._run(COMPARING, compare, settings, "measurements", failed, self._finish("compare"))
+        finish = self._finish("compare")
+        self._run(COMPARING, compare, settings, "measurements", failed=failed, finish=finish)
 
     @request("Writing the table")
     def export_measurements_table(self) -> None:
@@ -448,18 +433,32 @@ class ResultRequests(ChangeRequests):
 
 
 def _export_file(
-    job: Job, what: What, name: str, file_format: str, plan: MeshingPlan | None
+    job: Job,
+    what: What,
+    name: str,
+    file_format: str,
+    plan: MeshingPlan | None,
+    texture: int | None = None,
+    white: str = "",
 ) -> str:
-    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the
-    file's name."""
+    """Write one file, as `pipeline.export.export` does, or a mesh with a texture; returns a
+    sentence that begins with the file's name."""
     store, file_name = job.store, default_file_name(what, name, file_format)
-    with store.staged_export(file_name) as path:
-        exported = export(
-            store, what, name, out=path, plan=plan, accept_rejected=accepts_rejected(store),
-            progress=part(job.progress, 0, 0.98), warn=job.warn,
-        )  # fmt: skip
+    options: dict[str, Any] = {
+        "plan": plan, "accept_rejected": accepts_rejected(store),
+        "progress": part(job.progress, 0, 0.98), "warn": job.warn,
+    }  # fmt: skip
+    if texture is None:
+        with store.staged_export(file_name) as path:
+            words = export(store, what, name, out=path, **options).words
+    else:
+        source = f"{MERGED}{name}" if what == "merged-mesh" else name
+        out = store.exports / file_name
+        made = mesh(store, [source], out, texture=texture, white=white, **options)
+        assert made.textured is not None
+        words = f"{made.meshed.text().splitlines()[0]}; {made.textured.text()}"
     job.progress(1.0, "exported")
-    return f"{file_name} is ready to download: {exported.words}"
+    return f"{file_name} is ready to download: {words}"
 
 
 def _reword(error: BaseException) -> BaseException:

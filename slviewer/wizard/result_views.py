@@ -16,7 +16,8 @@ from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measured_surface import (
+from slviewer.pipeline.cloud_corrections import restrict_cloud
+from slviewer.pipeline.measure import (
     MERGED,
     MeasuredSurface,
     Place,
@@ -24,10 +25,9 @@ from slviewer.pipeline.measured_surface import (
     surface_from_cloud,
 )
 from slviewer.pipeline.models import load_model, load_stereo
+from slviewer.pipeline.operation import is_up_to_date
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
-from slviewer.pipeline.scan_edits import restrict_cloud
-from slviewer.pipeline.stored_records import is_up_to_date
 from slviewer.reconstruction.cloud import Cloud, Misfit
 from slviewer.report.maps import PixelCurve
 from slviewer.session.capture import Capture
@@ -126,7 +126,7 @@ def whole_cloud(session: Session, name: str, extrapolated: bool = False) -> Scan
 
 def merged_cloud(session: Session, name: str) -> Ply:
     """Load the merged points of a merge."""
-    return read_ply(session.exports / str(session.load_result(f"merge/{name}", only=())[0]["ply"]))
+    return read_ply(session.exports / str(session.load_meta(f"merge/{name}")["ply"]))
 
 
 def pixel_fits(session: Session) -> Mapping[Axis, PixelFit]:
@@ -180,7 +180,7 @@ def surface_to_measure(store: Session, name: str) -> MeasuredSurface:
     if not is_up_to_date(store, result):
         raise InputError(f"the inputs of {name} have changed: {again}, then measure")
     cut = "" if result == name else str(restriction_inputs(store, [name]))
-    return _read_surface(store.folder, name, store.load_result(result, only=())[0]["hash"], cut)
+    return _read_surface(store.folder, name, store.load_meta(result)["hash"], cut)
 
 
 @lru_cache(maxsize=1)

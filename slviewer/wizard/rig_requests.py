@@ -13,16 +13,16 @@ from slviewer.devices.capture import check_exposures
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import DamagedError, DeviceError, InputError, SlviewerError
-from slviewer.fringe.presets import PRESETS
+from slviewer.fringe.presets import find_preset
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture import choose_sequence, depth_axis
-from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.pipeline.duplicate import duplicate_calibration
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.examination import CheckVerdict, Preflight
+from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.rig_choice import Choice, RigSetup, save_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, ExposureSuggestion, suggest_exposure
 from slviewer.preflight.check_rig import preflight
-from slviewer.records.table import format_count
+from slviewer.records.record import format_count
 from slviewer.session.reading import expand_user
 from slviewer.session.recent import unused_folder
 from slviewer.session.store import Session
@@ -328,8 +328,7 @@ class RigRequests(Engine):
     @request("Choosing the patterns")
     def choose_patterns(self, name: str) -> None:
         """Set the pattern sequence of later captures."""
-        if name not in PRESETS:
-            raise InputError(f"no pattern sequence is called {name!r}: use {', '.join(PRESETS)}")
+        find_preset(name)
         self._store.decide("patterns", name)
 
     @request("Setting the wanted accuracy")

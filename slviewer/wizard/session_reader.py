@@ -1,9 +1,12 @@
-"""Reads what a session's files contain, for the panels. Descriptions of captures and results that
-did not change are not read again (`session.reading.identify`); features of poses are kept."""
+"""Reads what a session's files contain, for the panels, and what a list of sessions shows of each.
+Descriptions of captures and results that did not change are not read again
+(`session.reading.identify`); features of poses are kept."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -11,16 +14,17 @@ import numpy as np
 from slviewer.calibration.next_pose import count_cells, outline_px
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
-from slviewer.errors import DamagedError, SessionError
+from slviewer.errors import DamagedError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.geometry.vectors import finite_rows
-from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
+from slviewer.pipeline.cloud_corrections import describe_scale
 from slviewer.pipeline.models import (
     accepts_rejected,
     available_models,
     explain_board,
     find_target,
+    load_last_verdict,
     load_model,
     load_reprojection,
     load_stereo_if_complete,
@@ -28,13 +32,13 @@ from slviewer.pipeline.models import (
     recommended_model,
     rejection_reason,
 )
-from slviewer.pipeline.scale import describe_scale
-from slviewer.pipeline.stored_records import Stored, captures_of, load_record, load_stored
+from slviewer.pipeline.operation import Stored, captures_of, load_record, load_stored
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
-from slviewer.records.merge import Placement
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Placement, Reconstruction
+from slviewer.records.record import format_count, format_counts
+from slviewer.records.verdict import Level
 from slviewer.session.capture import Capture, Role, read_capture
 from slviewer.session.inspection_plan import list_plans
 from slviewer.session.names import join_names
@@ -42,8 +46,9 @@ from slviewer.session.nominal import NOMINALS
 from slviewer.session.scan_edits import list_edits, load_region
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.wizard.notices import describe_failure
+from slviewer.wizard.jobs import describe_failure
 from slviewer.wizard.pose_plan import PlanInput, Planner, PoseFeatures, PosePlan
+from slviewer.wizard.result_views import make_thumbnail
 from slviewer.wizard.snapshot import (
     CalibrationView,
     ExportView,
@@ -188,7 +193,7 @@ class SessionReader:
         result = f"poses/{capture.name}"
         with suppress(DamagedError):  # the pose is evaluated again
             if self.session.has_result(result):
-                meta = self._load_meta(result)
+                meta = self.session.load_meta(result)
                 made_of = meta["inputs"].get(capture.name), meta.get("target")
                 return meta if made_of == (capture.hash, target) else None
         return None
@@ -213,7 +218,6 @@ class SessionReader:
                 name=pose.name,
                 state=state,
                 why=why,
-                created=str(pose.meta.get("created", "")),
                 T_camera_board=(T := poses.get(pose.name)),
                 board_px=outline_px(given.board, plan.lens, T)
                 if given and plan and T is not None
@@ -243,7 +247,7 @@ class SessionReader:
         stereo = None if calibration is None or calibration.refused else calibration.stereo
         hashes = [(name, self._captures[name].hash) for name in features]
         if stereo:
-            hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
+            hashes.append(("", self.session.load_meta("calibration/stereo")["hash"]))
         return PlanInput(
             Board.parse(target), camera, projector, features, stereo, focal_px, refused,
             tuple(hashes),
@@ -268,7 +272,8 @@ class SessionReader:
             f"the features of {pose.name}", self._load_features, pose, target, meta
         )
         if calibration:
-            if self._load_meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
+            made_from = self.session.load_meta("calibration/stereo").get("inputs", {})
+            if made_from.get(pose.name) == pose.hash:
                 return "used", "", features
             why = calibration.stereo.excluded.get(pose.name, "")
             # such a pose was included again since
@@ -297,7 +302,7 @@ class SessionReader:
         models = available_models(session)
         if "stereo" not in models:
             return None
-        meta = self._load_meta("calibration/stereo")
+        meta = self.session.load_meta("calibration/stereo")
         stereo = load_stereo_if_complete(session)
         if stereo is None:
             return None
@@ -380,10 +385,6 @@ class SessionReader:
             undone_edits=undone,
         )
 
-    def _load_meta(self, result: str) -> dict[str, Any]:
-        """Load the `meta` of a result, without its arrays."""
-        return self.session.load_result(result, only=())[0]
-
 
 def _make_features(
     points: np.ndarray, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray
@@ -430,3 +431,50 @@ def missing_for_splined(session: Session) -> str:
         f"{needed}, and only {both} of {len(poses)} have them: choose patterns of both axes, and"
         " capture more"
     )
+
+
+@dataclass(frozen=True)
+class SessionOverview:
+    """A session: when it was changed last, what it `holds` in words, the verdict on its
+    calibration, None where there is none, and a JPEG of its first scan, else pose.
+
+    `fault`: why it cannot be read, empty where it can.
+    """
+
+    folder: Path
+    changed: datetime
+    holds: str = ""
+    is_calibrated: bool = False
+    verdict: Level | None = None
+    thumbnail: bytes = b""
+    fault: str = ""
+
+
+def read_overview(folder: Path) -> SessionOverview:
+    """Read what a list shows of a session; a damaged one has a fault."""
+    parts = [folder / name for name in ("session.json", "decisions.json", "captures", "results")]
+    times = [part.stat().st_mtime for part in parts if part.exists()]
+    changed = datetime.fromtimestamp(max(times, default=0.0)).astimezone()
+    try:
+        with Session.open(folder) as session:
+            return _read(session, changed)
+    except SlviewerError as error:
+        return SessionOverview(folder, changed, fault=str(error))
+
+
+def _read(session: Session, changed: datetime) -> SessionOverview:
+    """Read the overview of an open session."""
+    captures = session.captures()
+    holds = format_counts(each.purpose for each in captures)
+    if n := sum(name.startswith(f"{Measurement.kind}/") for name in session.result_names()):
+        holds += f", {format_count(n, 'measurement')}"
+    verdict, is_calibrated = None, "stereo" in available_models(session)
+    with suppress(SlviewerError):
+        verdict = load_last_verdict(session)
+    picture = b""
+    for capture in sorted(captures, key=lambda each: each.purpose == "scan", reverse=True):
+        with suppress(SlviewerError):
+            picture = make_thumbnail(capture)
+            break
+    level = verdict.level if verdict else None
+    return SessionOverview(session.folder, changed, holds, is_calibrated, level, picture)

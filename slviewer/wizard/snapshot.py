@@ -13,13 +13,12 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.devices.browser import PageRole
 from slviewer.devices.world import Thing
 from slviewer.pipeline.capture import Space
-from slviewer.pipeline.check_results import Preflight
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.examination import Preflight
+from slviewer.pipeline.operation import Stored
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.records.calibration import PixelwiseFit, Reprojection, SplinedFit
 from slviewer.records.measurement import Measurement
-from slviewer.records.merge import Merge, Placement
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Merge, Placement, Reconstruction
 from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict
 from slviewer.registration.refusal import Reason
@@ -138,7 +137,6 @@ class PoseView:
     name: str
     state: PoseState
     why: str
-    created: str
     T_camera_board: np.ndarray | None
     board_px: np.ndarray | None
     rms_px: tuple[float, float] | None

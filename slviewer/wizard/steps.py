@@ -9,7 +9,7 @@ from collections.abc import Callable
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
 from slviewer.calibration.stereo import MIN_POSES
 from slviewer.records.merge import MIN_OVERLAP
-from slviewer.records.table import format_count
+from slviewer.records.record import format_count
 from slviewer.records.verification import Verification
 from slviewer.session.atomic import format_bytes
 from slviewer.session.names import join_names

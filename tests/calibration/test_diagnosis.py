@@ -18,7 +18,7 @@ from slviewer.calibration.known_camera import KnownCamera
 from slviewer.calibration.observe import Observation
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.triangulation import triangulate_pixels
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import CAUSES, Finding, Verdict
 
 TRUE = rig()

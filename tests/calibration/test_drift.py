@@ -18,9 +18,8 @@ from slviewer.calibration.drift import (
 )
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
-from slviewer.records.drift import Drift
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import render_text
+from slviewer.records.acceptance import Drift
+from slviewer.records.record import from_plain, render_text, to_plain
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 

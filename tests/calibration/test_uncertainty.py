@@ -25,7 +25,7 @@ from slviewer.errors import InputError
 from slviewer.inspection.features import distance
 from slviewer.inspection.uncertainty import Spread, splined_shared
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
-from slviewer.records.table import render_text
+from slviewer.records.record import render_text
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.validation.prove_accuracy import (

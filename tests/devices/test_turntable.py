@@ -14,8 +14,7 @@ from slviewer.devices.protocols import Turntable
 from slviewer.devices.simulated import SimulatedTurntable
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError
-from slviewer.pipeline.rig_choice import check_choice, load_rig, set_up
-from slviewer.pipeline.turn import place_object
+from slviewer.pipeline.rig_choice import check_choice, load_rig, place_object, set_up
 from slviewer.preflight.turntable import check_turning
 from slviewer.simulation.rig import letter
 

@@ -34,7 +34,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.records.acceptance import Contribution, ErrorBudget
-from slviewer.records.table import render_text
+from slviewer.records.record import render_text
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter

@@ -11,8 +11,7 @@ from slviewer.errors import InputError
 from slviewer.evaluation import letter
 from slviewer.evaluation.fit import Comparison, fit_clouds, incidence
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.records.plain import to_plain
-from slviewer.records.table import render_text
+from slviewer.records.record import render_text, to_plain
 from slviewer.records.verification import Verification, average
 
 

@@ -20,10 +20,9 @@ from slviewer.pipeline.accept import (
     measure_held_out,
     split_folds,
 )
-from slviewer.pipeline.stored_records import read_record
-from slviewer.records.model_comparison import HeldOutPose, ModelComparison
-from slviewer.records.plain import to_plain
-from slviewer.records.table import render_text
+from slviewer.pipeline.operation import read_record
+from slviewer.records.acceptance import HeldOutPose, ModelComparison
+from slviewer.records.record import render_text, to_plain
 from slviewer.target.board import Board
 
 SIZE, PERIOD = (200, 150), 18.0

@@ -9,7 +9,7 @@ from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 
 K = np.array([[880.0, 0, 199.3], [0, 884.0, 151.7], [0, 0, 1]])
 D = np.array([-0.08, 0.11, 0.0009, -0.0007, 0.02])

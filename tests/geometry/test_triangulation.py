@@ -16,7 +16,7 @@ from slviewer.geometry.triangulation import (
     triangulate,
     triangulate_pixels,
 )
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 
 pytestmark = pytest.mark.computes
 

@@ -13,7 +13,7 @@ from slviewer.gui.shell import STAGES
 from slviewer.gui.steps.calibrate import verdict_html
 from slviewer.gui.steps.rig import checks_table
 from slviewer.gui.widgets import FINDINGS_PAGE, STEPS_PAGE, help_link
-from slviewer.pipeline.check_results import Check, CheckName, Preflight
+from slviewer.pipeline.examination import Check, CheckName, Preflight
 from slviewer.records.verdict import CAUSES, Finding, Verdict
 from slviewer.registration.refusal import Reason as Refusal
 from slviewer.server.help_pages import HelpPages, docs_folder

@@ -21,10 +21,10 @@ from slviewer.gui.steps.measure import COMPARE, FIT, PICK, Tool
 from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane
-from slviewer.pipeline.measured_surface import MeasuredSurface
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.measure import MeasuredSurface
+from slviewer.pipeline.operation import Stored
 from slviewer.records.measurement import DECIDED, Measurement, Quantity
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.report.surfaces import section_plot
 from slviewer.wizard.result_views import place_at
 

@@ -23,9 +23,9 @@ from slviewer.gui.merge_views import (
     merge_html,
     turntable_html,
 )
-from slviewer.pipeline.stored_records import Stored, save_record
+from slviewer.pipeline.operation import Stored, save_record
 from slviewer.records.merge import LoopClosure, Merge, RefusedPair, Registered
-from slviewer.records.table import use_labels
+from slviewer.records.record import use_labels
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 

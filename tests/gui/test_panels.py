@@ -39,14 +39,13 @@ from slviewer.gui.steps.scan import point_html, sort_scans
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html
 from slviewer.pipeline.accept import gather_results
-from slviewer.pipeline.calibrate import save_verdict
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.models import save_verdict
+from slviewer.pipeline.operation import Stored
+from slviewer.records.acceptance import HeldOutPose, ModelComparison
 from slviewer.records.calibration import SECOND_CAMERA, Reprojection
 from slviewer.records.measurement import Measurement
-from slviewer.records.model_comparison import HeldOutPose, ModelComparison
-from slviewer.records.plain import to_plain
-from slviewer.records.reconstruction import Reconstruction
-from slviewer.records.table import Cell, Table
+from slviewer.records.merge import Reconstruction
+from slviewer.records.record import Cell, Table, to_plain
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Shape, Verification
 from slviewer.server.secure import Serving

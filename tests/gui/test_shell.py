@@ -29,7 +29,7 @@ from wizard_page import (
 
 from slviewer.errors import UsageError
 from slviewer.gui.app import App, browser_opened, rig_choice
-from slviewer.pipeline.calibrate import save_verdict
+from slviewer.pipeline.models import save_verdict
 from slviewer.pipeline.rig_choice import save_rig
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.server.secure import Serving

@@ -53,6 +53,6 @@ def test_scan_outside_the_calibrated_depths_says_so(shown: Opened) -> None:
         page.get_by_text("of the points are outside the calibrated depths").first
     ).to_be_visible()
     expect(page.get_by_text("which includes what the calibration leaves uncertain")).to_be_visible()
-    expect(page.get_by_text("Extrapolated there")).to_be_visible()
+    expect(page.get_by_text("more points are extrapolated")).to_be_visible()
     expect(page.get_by_label("Extrapolated points")).to_be_checked()
     assert shown.errors == []

@@ -18,7 +18,7 @@ from slviewer.inspection.deviation import (
 )
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.records.measurement import ToleranceVerdict
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import MeshScene, demo_object

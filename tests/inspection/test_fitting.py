@@ -20,7 +20,7 @@ from slviewer.inspection.uncertainty import PointErrors, scatter_covariance
 from slviewer.reconstruction.cloud import Misfit
 from slviewer.reconstruction.rig_change import PointResponse, change_rig
 from slviewer.records.measurement import Quantity
-from slviewer.records.plain import from_plain
+from slviewer.records.record import from_plain
 from slviewer.session.atomic import to_json
 
 pytestmark = pytest.mark.computes

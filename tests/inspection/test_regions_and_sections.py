@@ -16,7 +16,7 @@ from slviewer.inspection.section import (
     radius_through,
     section,
 )
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 
 
 def test_regions_hold_the_points_they_were_made_of() -> None:

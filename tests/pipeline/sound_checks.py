@@ -1,7 +1,7 @@
 """Stored examinations of sound captures, so that commands need not compute them again."""
 
 from slviewer.pipeline.examination import VERSION
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.records.verdict import Examination
 from slviewer.session.store import Session
 

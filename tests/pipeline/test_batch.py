@@ -25,7 +25,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch, connect
 from slviewer.pipeline.reconstruct import reconstruct, verify
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.records.plain import to_plain
+from slviewer.records.record import to_plain
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan

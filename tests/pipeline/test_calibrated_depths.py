@@ -14,12 +14,11 @@ from slviewer.fringe.presets import multifrequency
 from slviewer.gui.steps.scan import describe_depths, live_html
 from slviewer.pipeline.cloud_record import check_depths, list_outside_depths
 from slviewer.pipeline.models import load_stereo, save_model
-from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operation import Job, load_record
 from slviewer.pipeline.reconstruct import scan_cloud
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.records.reconstruction import DepthCheck, Reconstruction
+from slviewer.records.merge import DepthCheck, Reconstruction
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import FLAT, BoardScene, Pose

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 from copies import copy_session
 from facts import missing_facts
+from operations import reconstructed
 
 from slviewer.calibration.observe import Smoothing
-from slviewer.pipeline.calibrate import calibrate, load_last_verdict, save_verdict
+from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.models import (
     available_models,
+    load_last_verdict,
     load_stereo,
     rejection_reason,
     save_model,
+    save_verdict,
     trash_models,
 )
 from slviewer.pipeline.poses import load_judged
@@ -115,6 +118,9 @@ def test_a_rejected_calibration_is_refused_by_every_command(
         "reconstruct", session, "pose_01", "--out", tmp_path / "cloud.ply", "--accept-rejected"
     )
     assert status == 0 and missing_facts(error, "rejected")
+    # as a batch does, without the runner of operations
+    made = reconstructed(session, "pose_01", out=tmp_path / "cloud.ply", accept_rejected=True)
+    assert made.points > 0
 
 
 def refuse(session: Path, pose: str, other: str, ply: Path, run: Run) -> None:

@@ -18,8 +18,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certificate, verify_report
 from slviewer.pipeline.inspect_parts import run_plan
-from slviewer.pipeline.measure import relate
-from slviewer.pipeline.measured_surface import load_surface
+from slviewer.pipeline.measure import load_surface, relate
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo

@@ -15,8 +15,8 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import complementary, p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.accept import REFERENCE, accept, check, load_drift_history
+from slviewer.pipeline.cloud_corrections import scale_factor
 from slviewer.pipeline.models import load_stereo
-from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.boards import printed_board

@@ -9,7 +9,7 @@ from slviewer.errors import InputError, SessionError
 from slviewer.pipeline.duplicate import duplicate_calibration
 from slviewer.pipeline.models import available_models
 from slviewer.session.store import Session
-from slviewer.wizard.session_overview import read_overview
+from slviewer.wizard.session_reader import read_overview
 
 
 def test_duplicate_has_a_fresh_calibration_and_no_scan(recorded: Path, tmp_path: Path) -> None:

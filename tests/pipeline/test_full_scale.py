@@ -25,7 +25,7 @@ from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.capture_phases import capture_texture, loss_warnings
-from slviewer.pipeline.exposure_check import check_capture_exposure
+from slviewer.pipeline.examination import check_capture_exposure
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.preflight.check_rig import check_recorded_rig, preflight

@@ -17,7 +17,7 @@ from slviewer.pipeline.inspect_parts import (
     process_capability,
     write_inspection,
 )
-from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.pipeline.measure import MeasuredSurface
 from slviewer.records.inspection import Characteristic, Inspection
 from slviewer.session.inspection_plan import (
     Alignment,

@@ -22,6 +22,7 @@ from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measure import (
+    MeasuredSurface,
     describe_measurement,
     export_measurements,
     format_measurements,
@@ -31,13 +32,12 @@ from slviewer.pipeline.measure import (
     section_lines,
     trash_measurement,
 )
-from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.pipeline.operation import Stored, list_records, load_stored, opened, save_record
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.stored_records import Stored, list_records, load_stored, opened, save_record
 from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.merge import Merge
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset

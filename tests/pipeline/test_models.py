@@ -13,8 +13,8 @@ from slviewer.calibration.splined import model as splined
 from slviewer.errors import InputError, SessionError
 from slviewer.pipeline import models
 from slviewer.pipeline.models import available_models, load_model, preferred_model, warn_if_stale
-from slviewer.pipeline.stored_records import save_record
-from slviewer.records.model_comparison import HeldOutError, ModelComparison
+from slviewer.pipeline.operation import save_record
+from slviewer.records.acceptance import HeldOutError, ModelComparison
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from slviewer.cli import main
-from slviewer.pipeline.stored_records import load_record
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.pipeline.operation import load_record
+from slviewer.records.merge import Reconstruction
 from slviewer.session.store import Session
 
 pytestmark = [pytest.mark.computes, pytest.mark.slow]  # two calibrations from large photographs

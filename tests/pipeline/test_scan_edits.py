@@ -12,13 +12,13 @@ from sound_checks import save_sound_checks
 from slviewer.cli import main
 from slviewer.errors import DamagedError, InputError, UsageError
 from slviewer.pipeline.certificate import verify_report
+from slviewer.pipeline.cloud_corrections import parse_region
 from slviewer.pipeline.edit import edit_scan, set_region
 from slviewer.pipeline.export import export
 from slviewer.pipeline.measure import measure
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.report import report
-from slviewer.pipeline.scan_edits import parse_region
 from slviewer.session.ply import read_ply
 from slviewer.session.scan_edits import load_edits, load_region
 from slviewer.session.store import Session

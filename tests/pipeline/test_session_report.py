@@ -16,10 +16,9 @@ from PIL import Image
 from slviewer.errors import DamagedError, InputError
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.operation import save_record
 from slviewer.pipeline.report import report
-from slviewer.pipeline.stored_records import save_record
-from slviewer.records.merge import Merge
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Merge, Reconstruction
 from slviewer.records.verification import ModelFit, Verification
 from slviewer.report.page import CERTIFICATE, split_page
 from slviewer.report.surfaces import draw_photo

@@ -13,7 +13,7 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.examination import examine_frames, load_examination, load_or_save_examination
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Examination
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter

@@ -9,17 +9,15 @@ import pytest
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError
 from slviewer.pipeline.calibrate import CalibrateSettings
+from slviewer.pipeline.operation import Stored, load_record, load_stored, name_records
 from slviewer.pipeline.operations import OPERATIONS
-from slviewer.pipeline.stored_records import Stored, load_record, load_stored, name_records
+from slviewer.records.acceptance import Drift, ModelComparison
 from slviewer.records.calibration import ModelCalibration, StereoFit
-from slviewer.records.drift import Drift
 from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import MeasuredRegion, Measurement
-from slviewer.records.merge import Merge, Placement
-from slviewer.records.model_comparison import ModelComparison
-from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Merge, Placement, Reconstruction
+from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, centre_distances_mm
 from slviewer.session.store import Session

@@ -13,11 +13,7 @@ from facts import missing_facts, raises
 from faulty_rig import breakable
 
 from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError, UsageError
-from slviewer.pipeline.feedback import ignore_progress
-from slviewer.pipeline.merge import MergeSettings, merge
-from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
-from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.turn import (
+from slviewer.pipeline.capture import (
     capture_turn,
     merge_turn,
     missing_steps,
@@ -26,6 +22,10 @@ from slviewer.pipeline.turn import (
     recorded_steps,
     turn,
 )
+from slviewer.pipeline.merge import MergeSettings, merge
+from slviewer.pipeline.operation import ignore_progress
+from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.refusal import Refused
 from slviewer.session.capture import TurnStep

@@ -17,12 +17,12 @@ from slviewer.geometry.shapes import fit_plane
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.capture_phases import decode_capture, match_second
 from slviewer.pipeline.models import load_calibration, load_pair
+from slviewer.pipeline.operation import load_record
 from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import set_up
-from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.camera_match import epipolar_lines
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.merge import Reconstruction
 from slviewer.records.verification import Verification
 from slviewer.session.capture import NewCapture, Role
 from slviewer.session.store import Session

@@ -16,7 +16,7 @@ from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import SimulatedTurntable, simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import Cancelled
-from slviewer.pipeline.check_results import Preflight
+from slviewer.pipeline.examination import Preflight
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.preflight.check_rig import check_rig, preflight
 from slviewer.preflight.turntable import check_turning

@@ -15,7 +15,7 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, p18
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.check_results import Preflight
+from slviewer.pipeline.examination import Preflight
 from slviewer.preflight.check_rig import check_recorded_rig
 from slviewer.session.capture import NewCapture
 from slviewer.session.store import Session

@@ -5,7 +5,7 @@ import pytest
 from facts import missing_facts
 
 from slviewer.devices.simulated import preset_rig
-from slviewer.pipeline.check_results import Check
+from slviewer.pipeline.examination import Check
 from slviewer.preflight.light import Burst
 from slviewer.preflight.rig_under_test import RigUnderTest
 from slviewer.preflight.stillness import check_motion

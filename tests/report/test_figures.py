@@ -14,11 +14,9 @@ from PIL import Image
 from slviewer.errors import InputError
 from slviewer.records.calibration import Reprojection
 from slviewer.report import maps
-from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up
-from slviewer.report.maps import PixelCurve, pixel_curves
-from slviewer.report.page import Figure
+from slviewer.report.maps import PixelCurve, coverage, pixel_curves, pose_bars, residual_arrows
+from slviewer.report.page import DENSITY, FULL, MODELS, Figure, finish_figure, new_figure, round_up
 from slviewer.report.planes import planes_in_space
-from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
 from slviewer.report.surfaces import draw_clouds, draw_merged_cloud
 from slviewer.surface.fuse import Fused
 from slviewer.surface.shapes import PointSet

@@ -9,7 +9,7 @@ import pytest
 from facts import raises
 
 from slviewer.errors import InputError, SessionError
-from slviewer.records.table import Cell, Column, Table
+from slviewer.records.record import Cell, Column, Table
 from slviewer.report.page import Figure, Headline, PageNotice, Section, TitlePage, write_page
 
 PIXELS = np.zeros((4, 300, 3), np.uint8)

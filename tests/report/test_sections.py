@@ -12,18 +12,22 @@ from made_up import MODELS, planes, reproduction_data, session_data, spheres
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.pipeline.accept import gather_results
-from slviewer.pipeline.stored_records import read_record
-from slviewer.records.acceptance import AcceptanceTest, Decision
+from slviewer.pipeline.operation import read_record
+from slviewer.records.acceptance import (
+    AcceptanceTest,
+    Decision,
+    Drift,
+    HeldOutPose,
+    ModelComparison,
+)
 from slviewer.records.calibration import ModelCalibration, SplinedFit, VolumeSigma
-from slviewer.records.drift import Drift
 from slviewer.records.inspection import (
     Characteristic,
     CharacteristicResult,
     Inspection,
     PartResult,
 )
-from slviewer.records.model_comparison import HeldOutPose, ModelComparison
-from slviewer.records.table import Cell, Table, better_worse, compare_errors
+from slviewer.records.record import Cell, Table, better_worse, compare_errors
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Verification
 from slviewer.report.page import Figure, PageNotice, Section, write_page

@@ -22,8 +22,8 @@ from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.accept import read_artefact
 from slviewer.pipeline.certificate import read_certificate
+from slviewer.pipeline.cloud_corrections import parse_region
 from slviewer.pipeline.rig_choice import load_rig
-from slviewer.pipeline.scan_edits import parse_region
 from slviewer.printable import escape_controls
 from slviewer.report.page import CERTIFICATE
 from slviewer.server.credentials import load_tokens

@@ -18,8 +18,8 @@ from slviewer.errors import SessionError
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray
 from slviewer.pipeline.import_captures import import_captures
+from slviewer.pipeline.operation import opened_or_made
 from slviewer.pipeline.report import inspect
-from slviewer.pipeline.stored_records import opened_or_made
 from slviewer.session import atomic, store
 from slviewer.session.capture import NewCapture
 from slviewer.session.layout import WriterLock

@@ -11,7 +11,7 @@ from facts import missing_facts
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import AXES, gray_bits, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.pipeline.feedback import ignore_progress
+from slviewer.pipeline.operation import ignore_progress
 from slviewer.simulation.boards import BoardShape
 from slviewer.simulation.plans import letter_plan, planes
 from slviewer.simulation.renderer import Renderer

@@ -10,7 +10,7 @@ import pytest
 from facts import missing_facts
 
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.feedback import ignore_progress
+from slviewer.pipeline.operation import ignore_progress
 from slviewer.validation import prove_captures as captures
 from slviewer.validation.capture_faults import CAPTURE_FAULTS, FaultyCapture, draw_faulty
 from slviewer.validation.prove_captures import (

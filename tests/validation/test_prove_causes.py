@@ -7,7 +7,7 @@ from functools import cache, partial
 import pytest
 from facts import missing_facts
 
-from slviewer.pipeline.feedback import ignore_progress
+from slviewer.pipeline.operation import ignore_progress
 from slviewer.validation import prove_causes as causes
 from slviewer.validation.proof import Proof
 from slviewer.validation.prove_causes import FAULTS, FaultBench

@@ -20,8 +20,7 @@ from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.simulation.rig import letter
 from slviewer.wizard.acquisition import Acquisition
-from slviewer.wizard.jobs import Jobs
-from slviewer.wizard.notices import Notices
+from slviewer.wizard.jobs import Jobs, Notices
 from slviewer.wizard.service import Timing
 from slviewer.wizard.snapshot import CaptureProgress, Level
 

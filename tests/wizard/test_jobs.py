@@ -13,8 +13,7 @@ from facts import missing_facts
 from wizard_events import HANG_S, until
 
 from slviewer.errors import CalibrationRejected, Cancelled
-from slviewer.wizard.jobs import Jobs, Reporter, release_memory
-from slviewer.wizard.notices import Notices
+from slviewer.wizard.jobs import Jobs, Notices, Reporter, release_memory
 
 
 @pytest.fixture

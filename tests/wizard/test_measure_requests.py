@@ -14,8 +14,8 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
+from slviewer.pipeline.operation import list_records
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.stored_records import list_records
 from slviewer.records.measurement import Measurement
 from slviewer.session.inspection_plan import read_plan
 from slviewer.session.names import plain_name

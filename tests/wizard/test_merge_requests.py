@@ -11,8 +11,8 @@ from wizard_events import HANG_S
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.merge import load_placements, view_places
+from slviewer.pipeline.operation import Stored, read_record
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.stored_records import Stored, read_record
 from slviewer.records.merge import Merge
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session

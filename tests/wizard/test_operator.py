@@ -231,7 +231,7 @@ def test_hands_free_captures_a_board_that_is_held_still_once(tmp_path: Path) -> 
 def test_a_plane_is_not_captured_while_the_board_is_surely_in_view(operator: Operator) -> None:
     def refusal(**options: bool) -> str:
         """What a capture of a plane lacks; there is no calibration yet."""
-        assert not operator.capture_plane(**options)
+        assert not operator.capture_scan(purpose="plane", **options)
         return last_notice(operator.wait_until_idle())
 
     assert operator.place_at_suggestion()

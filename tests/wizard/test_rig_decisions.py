@@ -12,7 +12,7 @@ from wizard_events import HANG_S, SPARING, last_notice, until, wait_until_open
 
 from slviewer.gui.widgets import PICTURE_PX, draw_preview
 from slviewer.pipeline.capture import capture
-from slviewer.pipeline.check_results import Preflight
+from slviewer.pipeline.examination import Preflight
 from slviewer.pipeline.rig_choice import load_rig
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator

@@ -10,7 +10,7 @@ from slviewer.calibration.next_pose import Coverage, nominal_lens
 from slviewer.calibration.stereo import MIN_POSES, StereoModel
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture import Space
-from slviewer.records.reconstruction import DepthCheck, Reconstruction
+from slviewer.records.merge import DepthCheck, Reconstruction
 from slviewer.target.board import Board
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 from slviewer.wizard.snapshot import (
@@ -39,7 +39,7 @@ def planned(covered: bool, sigma_mm: float | None = None) -> PosePlan:
 
 
 def poses(n: int, state="good", why: str = "") -> tuple[PoseView, ...]:
-    return tuple(PoseView(f"pose_{i}", state, why, "", None, None, None, b"") for i in range(n))
+    return tuple(PoseView(f"pose_{i}", state, why, None, None, None, b"") for i in range(n))
 
 
 def calibration(stale: str = "") -> CalibrationView:

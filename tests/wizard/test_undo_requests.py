@@ -21,8 +21,8 @@ from slviewer.session.scan_edits import list_edits, load_edits
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard import result_requests
+from slviewer.wizard.engine import Step, UndoHistory
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.undo_history import Step, UndoHistory
 
 SEQUENCE = PatternSequence((16, 12), tuple(phase_steps("x", 4, 8.0)))
 

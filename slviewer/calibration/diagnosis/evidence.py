@@ -10,7 +10,7 @@ from slviewer.calibration.known_camera import CameraCheck
 from slviewer.calibration.squareness import Squareness
 from slviewer.calibration.stereo import MIN_TILT_SPREAD_DEG
 from slviewer.fringe.sequence import Axis
-from slviewer.records.plain import from_plain
+from slviewer.records.record import from_plain
 from slviewer.records.verdict import Cause, Finding
 
 MIN_DEPTH_SHARE = 3e-5
@@ -92,7 +92,7 @@ class PoseEvidence:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "PoseEvidence":
-        """Return the evidence that `records.plain.to_plain` saved; None is read as NaN."""
+        """Return the evidence that `records.record.to_plain` saved; None is read as NaN."""
         axes = {
             name: {k: np.nan if v is None else v for k, v in axis.items()}
             for name, axis in data["axes"].items()

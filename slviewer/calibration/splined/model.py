@@ -44,7 +44,7 @@ from slviewer.geometry.rigid import Mask, move_points, rigid_transform
 from slviewer.geometry.triangulation import check_map
 from slviewer.geometry.vectors import box_middle, finite_rows, rms
 from slviewer.records.calibration import SplinedFit, VolumeSigma
-from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import from_plain, to_plain
 
 _BUNDLE_ARRAYS = ("points", "camera_poses", "projector_poses")
 NEAR, FAR = 0.7, 1.4

@@ -28,11 +28,10 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.pipeline.report import calibration_view
-from slviewer.records.model_comparison import ModelComparison
-from slviewer.records.verdict import Cause, Finding, Verdict
-from slviewer.report.maps import PixelCurve, pixel_curves, rms_maps
+from slviewer.records.acceptance import ModelComparison
+from slviewer.records.verdict import Finding, Verdict
+from slviewer.report.maps import PixelCurve, pixel_curves, pose_bars, residual_arrows, rms_maps
 from slviewer.report.page import Figure
-from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.report.session import CalibrationFigures, lens_table, rig_table
 from slviewer.target.board import Board
 from slviewer.wizard import result_views
@@ -161,12 +160,9 @@ class CalibratePanel(StepPanel):
             self._named.options = tuple(names[:_MOST_NAMED])
         self._named.visible = bool(names)
 
-    def _names_cause(self, cause: Cause) -> bool:
-        """Whether the verdict states this cause."""
-        return self.session.verdict is not None and cause in self.session.verdict.causes
-
     def _draw_models(self, calibration: CalibrationView, busy: bool) -> None:
         """Show the choice and the comparison of the models."""
+        stated = self.session.verdict.causes if self.session.verdict else ()
         found = self.session.list_records(ModelComparison)
         compared = next((each.record for each in found if not each.stale), None)
         self._choice_note.set(model_choice_html(calibration, compared))
@@ -181,7 +177,7 @@ class CalibratePanel(StepPanel):
         splined = Html("")
         if calibration.splined:
             splined = report_table(calibration.reprojection.rename(calibration.splined.table()))
-        elif calibration.missing and not self._names_cause("too-few-poses"):
+        elif calibration.missing and "too-few-poses" not in stated:
             splined = note(f"No splined model: {calibration.missing}.")
         self._comparison.set(records_html(found) + splined)
 

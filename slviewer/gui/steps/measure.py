@@ -22,11 +22,10 @@ from slviewer.gui.widgets import Html, Text, colour_bar, note, to_html
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measure import What
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
-from slviewer.pipeline.stored_records import Stored, load_arrays
+from slviewer.pipeline.measure import MERGED, MeasuredSurface, Place, What
+from slviewer.pipeline.operation import Stored, load_arrays
 from slviewer.records.measurement import Measurement
-from slviewer.report.canvas import round_up
+from slviewer.report.page import round_up
 from slviewer.session.nominal import MM, Units
 from slviewer.wizard.result_views import box_in_view, place_at, point_at, snap
 from slviewer.wizard.snapshot import SessionView

@@ -25,7 +25,7 @@ from slviewer.gui.widgets import (
     paragraph,
     to_html,
 )
-from slviewer.pipeline.check_results import CheckVerdict, Preflight
+from slviewer.pipeline.examination import CheckVerdict, Preflight
 from slviewer.pipeline.rig_choice import Choice, Preset, check_choice, presets
 from slviewer.server.viser_internals import make_private
 from slviewer.session.store import Session

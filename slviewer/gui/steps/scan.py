@@ -35,11 +35,12 @@ from slviewer.gui.widgets import (
     note,
     paragraph,
     properties_table,
+    record_properties,
     thumbnail,
     to_html,
 )
 from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
-from slviewer.records.reconstruction import REPORTED_OUTSIDE
+from slviewer.records.merge import REPORTED_OUTSIDE, Reconstruction
 from slviewer.records.verification import Verification
 from slviewer.simulation.concave import CONCAVE
 from slviewer.wizard.result_views import (
@@ -456,32 +457,18 @@ def point_html(cloud: ScanCloud, u: int, v: int) -> Html:
 
 
 def scan_html(scan: ScanView) -> Html:
-    """Return a table of a scan's figures, with warnings."""
+    """Return a table of a scan's figures, with what is to be known of its points."""
     if scan.cloud == "absent":
         return note("Not reconstructed yet.", "warning")
-    figures, depth, noise = scan.figures, scan.figures.depth_mm, scan.figures.noise_mm
-    masked = figures.masked
-    properties = {
-        "Points": f"{figures.points:,}",
-        "Model": figures.model,
-        "Depth range": None if depth is None else f"{depth[0]:.0f} to {depth[1]:.0f} mm",
-        "Median noise of z": None if noise is None else f"{noise:.3f} mm",
-        "Not supported by poses": None if masked is None else f"{100 * masked:.1f} % of pixels",
-        "Extrapolated there": (
-            f"{figures.extrapolated:,} points, sigma {figures.extrapolated_mm:.3f} mm"
-            if figures.extrapolated_mm
-            else None
-        ),
-    }
-    html = properties_table(display_name(scan.name, scan.label), properties)
-    if masked is not None and masked > MUCH_MASKED:
+    figures = scan.figures
+    (table,) = Reconstruction.tables({scan.name: figures})
+    html = record_properties(display_name(scan.name, scan.label), table)
+    if figures.masked is not None and figures.masked > MUCH_MASKED:
         html += alert(
             "Much is not supported: capture target poses at the object's place.", "warning"
         )
-    if figures.depths and not figures.depths.is_good:
-        html += alert(f"{figures.depths.text()}.", "warning")
-    if figures.scale:
-        html += paragraph(f"{figures.scale[:1].upper()}{figures.scale[1:]}.")
+    tone: Tone = "dim" if figures.is_good else "warning"
+    html += "".join(alert(f"{text[:1].upper()}{text[1:]}.", tone) for text in figures.list_notes())
     if scan.cloud == "stale":
         html += note("Made with an older calibration: reconstruct it again.", "warning")
     return html

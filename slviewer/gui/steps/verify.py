@@ -18,7 +18,7 @@ from slviewer.gui.widgets import (
     colours,
     records_html,
 )
-from slviewer.pipeline.stored_records import Stored, load_arrays
+from slviewer.pipeline.operation import Stored, load_arrays
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
@@ -54,13 +54,13 @@ class VerifyPanel(StepPanel):
             self._captures = [
                 self.button(
                     "Capture plane",
-                    lambda: operator.capture_plane(label.value, anyway=self._anyway.value),
+                    lambda: operator.capture_scan(label.value, "plane", anyway=self._anyway.value),
                     "square",
                     None,
                 ),
                 self.button(
                     "Capture sphere",
-                    lambda: operator.capture_sphere(label.value, anyway=self._anyway.value),
+                    lambda: operator.capture_scan(label.value, "sphere", anyway=self._anyway.value),
                     "sphere",
                 ),
             ]

@@ -10,7 +10,7 @@ import trimesh
 
 from slviewer.geometry.rigid import move_points, rigid_transform
 from slviewer.pipeline.compare import compare
-from slviewer.pipeline.measured_surface import load_surface
+from slviewer.pipeline.measure import load_surface
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.operation import Job
 from slviewer.reconstruction.cloud import Cloud
