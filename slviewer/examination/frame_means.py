@@ -51,7 +51,7 @@ def shows_wave(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) 
     the light's wave does: gamma imitates a wave at the pixels, but not in the mean over fringes."""
     rows = stack[:, :, :: limits.MEAN_COLUMNS].mean(axis=2)
     waves = np.stack(evaluate_waves(np.linspace(-0.5, 0.5, rows.shape[1]), light))
-    products = np.zeros(3)
+    products = {kind: np.zeros(3) for kind in limits.SEEN_OF_ROWS}
     for group in _list_equal_sums(sequence):
         first = sequence.frames[group[0, 0]]
         if first.kind == "phase" and first.axis == "y":
@@ -61,13 +61,11 @@ def shows_wave(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) 
         seen = (excess - excess.mean(axis=1, keepdims=True)) @ waves.T * (2 / rows.shape[1])
         own = light.wave[group].mean(axis=1)
         own = own - own.mean(axis=0)
-        products += np.sum(seen * own), np.sum(seen**2), np.sum(own**2)
-    share, (fewest, most) = products[0], limits.SEEN_WAVE
-    return bool(
-        share > 0
-        and share**2 > limits.SEEN_OF_ROWS * products[1] * products[2]
-        and fewest < share / products[2] < most
-    )
+        products[first.kind] += np.sum(seen * own), np.sum(seen**2), np.sum(own**2)
+    kind = "phase" if products["phase"].any() else "gray"
+    (share, seen, own), (fewest, most) = products[kind], limits.SEEN_WAVE
+    is_alike = share > 0 and share**2 > limits.SEEN_OF_ROWS[kind] * seen * own
+    return bool(is_alike and fewest < share / own < most)
 
 
 def _list_equal_sums(sequence: PatternSequence) -> Iterator[np.ndarray]:

@@ -532,7 +532,8 @@ def _is_large(
         return float(np.ptp(light.room)) > limits.LEAST_ROOM
     logs = np.log(light.gain)
     if term == "drift":
-        return float(np.ptp(logs)) > limits.REPORTED
+        before, after, _ = measure_unequal_means(sequence, stack, light)
+        return float(np.ptp(logs)) > limits.REPORTED and after < limits.LEFT_BY_DRIFT * before
     for steps in list_shifts(sequence):
         least = limits.LEAST_GAIN if len(steps) > 3 else limits.LEAST_GAIN_OF_THREE
         if logs[[*steps]].std() > least:

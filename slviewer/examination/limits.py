@@ -159,9 +159,13 @@ FARTHEST_GAIN = 0.7
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
 """Rms of a wave along the rows, and change of the room's light over the mean grey level, that are
 corrected."""
-SEEN_OF_ROWS, SEEN_WAVE = 0.5, (0.5, 2.0)
+LEFT_BY_DRIFT = 0.5
+"""Part of the inequality of frames' means that a drift leaves at most: blurred stripes of dim
+captures are clipped more or less by their width, and imitate one in part."""
+SEEN_OF_ROWS, SEEN_WAVE = {"phase": 0.7, "gray": 0.25}, (0.5, 2.0)
 """Share of the variation of the rows' means that a wave must explain, and their amplitude over the
-wave's: light that does not vary, and scattered light, lower it."""
+wave's. Phase steps have equal means (flicker explains 0.97 and more, what imitates it 0.53 at
+most); sums of a bit and its inverse also vary with blur and clipping (flicker explains 0.46)."""
 FEW_FRAMES_KNOWN = 3
 """Frames on either side of a change of the room's light: one or two may just be of other gain."""
 REFUTED, REFUTED_LEAST = 1.5, 0.004

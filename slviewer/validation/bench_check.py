@@ -14,6 +14,7 @@ from slviewer.examination.examine import examine
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
+from slviewer.geometry.jit import run_rows
 from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.reconstruction.onepass import OnePass
@@ -124,7 +125,11 @@ def _prepare_stages(scale: float, folder: Path) -> dict[str, tuple[Measure, Meas
 
     def floor(numbers: int, written: tuple[int, int, int]) -> Measure:
         """Return the moving of the bytes of the frames and of arrays."""
-        return _clock(partial(move_bytes, *allocate_floor(frames, numbers, written)))
+        return _clock(
+            partial(
+                run_rows, move_bytes, frames.shape[1], *allocate_floor(frames, numbers, written)
+            )
+        )
 
     again = partial(reconstruct, session, "scan_01", out=folder / "again.ply")
     command = "reconstruct", str(session), "scan_01", "--out", str(folder / "command.ply")
