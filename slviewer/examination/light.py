@@ -97,8 +97,8 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
             gains = light = min(light, other, key=lambda x: _score(judged, base, x, first))
         if len(terms) > 1 and not _is_large(base.sequence, stack, light, "gain"):
             light = replace(light, gain=constant.gain, terms=light.terms[1:])
-        is_large = _is_large(base.sequence, stack, light, terms[-1])
         own = _score(judged, base, light, first)
+        is_large = _is_large(base.sequence, stack, light, terms[-1], own)
         if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
     light = _accept(base.sequence, stack, best, score) if best.terms else constant
@@ -521,13 +521,18 @@ def _measure_losses(
 
 
 def _is_large(
-    sequence: PatternSequence, stack: np.ndarray, light: FrameLight, term: Variation
+    sequence: PatternSequence,
+    stack: np.ndarray,
+    light: FrameLight,
+    term: Variation,
+    left: float = 1.0,
 ) -> bool:
-    """Return whether a term of the light is large enough to be corrected, and a wave is in the
-    means of the rows."""
+    """Return whether a term of the light, which leaves that share of the residual, is large enough
+    to be corrected: a drift also makes the means of equal frames equal, and those of rows show a
+    wave that leaves much; of few fringes in view they differ anyway."""
     if term == "wave":
-        is_large = float(np.sqrt(np.mean(light.wave**2))) > limits.LEAST_WAVE
-        return is_large and shows_wave(sequence, stack, light)
+        is_seen = left <= limits.EXPLAINED_WELL or shows_wave(sequence, stack, light)
+        return is_seen and float(np.sqrt(np.mean(light.wave**2))) > limits.LEAST_WAVE
     if term == "room":
         return float(np.ptp(light.room)) > limits.LEAST_ROOM
     logs = np.log(light.gain)

@@ -137,7 +137,7 @@ NO_WORSE = 1.1
 from step to step."""
 BETTER_LIGHT, EXPLAINED_WELL = (0.9, 0.75), 0.05
 """Share of the residual that one term of the light, and a second one, may leave; and the share that
-a single term leaves where no second one is tried."""
+a single term leaves where no second one is tried, nor the rows asked whether they show a wave."""
 EXPLAINED_BY_LIGHT, EXPLAINED_CLEARLY = 0.78, 0.55
 """Share of the residual that light may leave where equal means do not confirm it, and where they
 refute it, as those of few fringes in view do."""
@@ -164,8 +164,8 @@ LEFT_BY_DRIFT = 0.5
 captures are clipped more or less by their width, and imitate one in part."""
 SEEN_OF_ROWS, SEEN_WAVE = {"phase": 0.7, "gray": 0.25}, (0.5, 2.0)
 """Share of the variation of the rows' means that a wave must explain, and their amplitude over the
-wave's. Phase steps have equal means (flicker explains 0.97 and more, what imitates it 0.53 at
-most); sums of a bit and its inverse also vary with blur and clipping (flicker explains 0.46)."""
+wave's. Phase steps have equal means (flicker explains 0.93 and more); sums of a bit and its inverse
+also vary with blur and clipping (flicker explains 0.46)."""
 FEW_FRAMES_KNOWN = 3
 """Frames on either side of a change of the room's light: one or two may just be of other gain."""
 REFUTED, REFUTED_LEAST = 1.5, 0.004
