@@ -53,20 +53,17 @@ class Preparation:
     ) -> None:
         self._report, self._command = report, command
         self._process: subprocess.Popen[str] | None = None
-        self._thread = threading.Thread(
-            target=self._follow, name="slviewer preparation", daemon=True
-        )
+        self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Start the process, unless it has ended well before; where that fails, kernels are
         compiled when they are first used."""
-        done = prepared_file()
-        if done is None or done.exists() or os.environ.get(SWITCHED_OFF):
+        if os.environ.get(SWITCHED_OFF) or (done := prepared_file()) is None or done.exists():
             return
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
         pipe = subprocess.PIPE
         try:
-            self._process = subprocess.Popen(
+            self._process = process = subprocess.Popen(
                 self._command,
                 stdin=pipe,
                 stdout=pipe,
@@ -77,6 +74,9 @@ class Preparation:
         except OSError as error:
             logging.getLogger(__name__).warning("kernels cannot be compiled beforehand: %s", error)
             return
+        self._thread = threading.Thread(
+            target=self._follow, args=(process, done), name="slviewer preparation", daemon=True
+        )
         self._thread.start()
 
     def close(self) -> None:
@@ -91,13 +91,12 @@ class Preparation:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _follow(self) -> None:
-        """Follow the progress of the process, and note when it has ended well."""
-        assert self._process is not None and self._process.stdout is not None
-        done = prepared_file()
-        for line in self._process.stdout:
+    def _follow(self, process: subprocess.Popen[str], done: Path) -> None:
+        """Follow the progress of the process, and make the file ``done`` when it has ended well."""
+        assert process.stdout is not None
+        for line in process.stdout:
             self._report(float(line))
-        if self._process.wait() == 0 and done is not None:
+        if process.wait() == 0:
             done.touch()
         self._report(None)
 

@@ -32,7 +32,7 @@ def prepare(status: int) -> list[float | None]:
         reports.append, [sys.executable, "-c", SCRIPT.format(status=status)]
     )
     preparation_process.start()
-    if preparation_process._thread.ident:
+    if preparation_process._thread:
         preparation_process._thread.join(HANG_S)
     return reports
 
