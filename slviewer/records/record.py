@@ -107,7 +107,7 @@ Row = dict[Any, Any]
 class Column:
     """A column's heading, its unit, the group of neighbours that it shares a heading with, and the
     decimals of its numbers. ``align``: by default a `Table` puts texts to the left, numbers to the
-    right. ``detail``: left out where a table is narrow."""
+    right. ``detail``: omitted where a table is narrow."""
 
     title: str
     unit: str = ""

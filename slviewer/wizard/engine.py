@@ -177,7 +177,7 @@ def edit_step(store: Session, made: Mapping[str, str], redo: bool = False) -> St
 
 
 def move_step(source: Path, target: Path) -> Step:
-    """Return the step that moves a file; a missing one is left out."""
+    """Return the step that moves a file; a missing one is omitted."""
 
     def act() -> Step:
         """Move the file."""

@@ -36,7 +36,7 @@ from slviewer.calibration.splined.unknowns import State, board_frame
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.geometry.rigid import Floats
-from slviewer.geometry.vectors import box_middle, shared_rms
+from slviewer.geometry.vectors import shared_rms
 
 MIN_POSES = 3
 MAX_STEPS = 30
@@ -309,9 +309,8 @@ def pose_residuals(
     samples = observation.samples
     if observation.name not in bundle.poses or samples is None:
         return None
-    i, points = bundle.poses.index(observation.name), observation.points
-    if observation.name in bundle.half_turned_poses:
-        points = 2 * box_middle(bundle.points) - points
+    i = bundle.poses.index(observation.name)
+    points = bundle.numbered_points(observation.name, observation.points)
     distances, feature = scipy.spatial.cKDTree(bundle.points[:, :2]).query(points[:, :2])
     known = distances < 1e-3
     data = PoseData(

@@ -29,6 +29,7 @@ from slviewer.calibration.splined.unknowns import HEIGHT_TERMS, LENS, State
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats, Floats32, Mask
+from slviewer.geometry.vectors import box_middle
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,12 @@ class Bundle:
         """Cells (rows, columns) bool of the camera's and of the projector's field that target poses
         illuminated."""
         return self.camera_poses > 0, self.projector_poses > 0
+
+    def numbered_points(self, pose: str, points: Floats) -> Floats:
+        """Return a pose's features (n, 3) mm as the adjustment numbers them: from the board's other
+        end where it turned the pose."""
+        is_turned = pose in self.half_turned_poses
+        return 2 * box_middle(self.points) - points if is_turned else points
 
     def point_jacobian(self, axis: Axis, pixels: Floats, z: Floats) -> "scipy.sparse.csr_matrix":
         """Return the Jacobian (3 n, unknowns) of measured points, mm per unit of the rig's

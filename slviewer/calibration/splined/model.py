@@ -42,7 +42,7 @@ from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Mask, move_points, rigid_transform
 from slviewer.geometry.triangulation import check_map
-from slviewer.geometry.vectors import box_middle, finite_rows, rms
+from slviewer.geometry.vectors import finite_rows, rms
 from slviewer.records.calibration import SplinedFit, VolumeSigma
 from slviewer.records.record import from_plain, to_plain
 
@@ -332,11 +332,10 @@ def calibrate_projector(
     Raises CalibrationRejected where they do not determine the projector, and as
     ``calibrate_splined``.
     """
-    bundle, opposite = pair.bundle, 2 * box_middle(pair.bundle.points)
-    used = list[Observation]()
+    bundle, used = pair.bundle, list[Observation]()
     for o in observations:
         if o.light is not None and o.name in bundle.poses and o.name not in bundle.excluded:
-            points = opposite - o.points if o.name in bundle.half_turned_poses else o.points
+            points = bundle.numbered_points(o.name, o.points)
             used.append(replace(o.light, camera=o.camera, points=points))
     if not used:
         raise InputError("no target pose has patterns along both axes")
