@@ -44,7 +44,7 @@ LEAST_DAMPING, DAMPING_STEP, MOST_DAMPING = 1e-6, 10.0, 10.0
 """Damping relative to the information's diagonal: smallest value, factor between trials, and
 limit."""
 CONVERGENCE_SIGMAS = 0.02
-"""Largest RMS change of the predicted observations at convergence, in sigmas."""
+"""Largest RMS change of the predicted observations that is left at convergence, in sigmas."""
 STRENGTH_STEPS = 3
 """Number of updates of the priors' strengths, which converge after two."""
 MIN_SAMPLES = 3
@@ -121,9 +121,9 @@ def adjust_bundle(
         [name in marked or not is_numbering_ambiguous(stereo.board) for name in names]
     )
     half_turned = np.zeros(len(names), bool)
-    updates, count, damping = 0, 0, 0.0
-    # for one large matrix, not for many small ones
-    with threadpool_limits(numba.get_num_threads(), user_api="blas"):
+    updates, count, damping, moved = 0, 0, 0.0, 0.0
+    # more threads gain a tenth, and take many times as long where other work uses the cores
+    with threadpool_limits(1, user_api="blas"):
         residuals = _residuals(state, data)
         for step in range(1, MAX_STEPS + 1):
             if step == 3:  # before such poses seem to contradict the others
@@ -146,13 +146,15 @@ def adjust_bundle(
             state, residuals, move, damping = _take_step(
                 state, residuals, data, weights, prior, system, damping
             )
-            moved = float(np.sqrt(max(float(move @ b), 0.0) / count))
+            before, moved = moved, float(np.sqrt(max(float(move @ b), 0.0) / count))
             if progress:
                 progress(step / (step + 3))
             if moved < 0.3 and updates < STRENGTH_STEPS:
                 prior = prior.update_strengths(state, factor.solve)
                 updates += 1
-            elif moved < CONVERGENCE_SIGMAS:
+            elif moved < CONVERGENCE_SIGMAS or (
+                updates == STRENGTH_STEPS and moved**2 < CONVERGENCE_SIGMAS * (before - moved)
+            ):  # further steps, each moved / before of the one before, sum to less
                 break
         else:
             raise CalibrationRejected(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-import scipy
+import scipy.linalg
 
 from slviewer.calibration.splined.residuals import (
     CAMERA,
