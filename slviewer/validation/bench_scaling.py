@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numba
 import numpy as np
 
 from slviewer.calibration.observe import Observation
@@ -41,8 +42,8 @@ WHOLE_MEGAPIXELS = (2.0, 8.0, 24.0)
 """Of captures that are read, decoded, reconstructed and written."""
 POSES = (10, 40, 200)
 SCANS = (3, 12, 50)
-CAPTURES = (50, 150, 500)
-WORKERS = (1, 2)
+CAPTURES = (50, 200, 1000)
+WORKERS = (1, 2, 4)
 BATCH = 8
 """Captures of a batch."""
 MOST_MB = 16_000.0
@@ -51,7 +52,7 @@ SCALE = 0.25
 NOISE_MM = 0.02
 SLOW_S = 1.0
 """What takes longer is measured once."""
-LINEAR = 1.1
+LINEAR = 1.05
 """Largest exponent that counts as linear."""
 
 
@@ -217,13 +218,13 @@ def save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
 
 
 def _time_batches(scene: Any) -> list[Row]:
-    """Rows of a batch of captures on one worker and on two; empty without the packages that batches
-    need."""
+    """Rows of a batch of captures on each number of workers, with their efficiency: the speed that
+    each adds, beside that of one worker alone; empty without the packages that batches need."""
     try:
         from distributed import Client, LocalCluster
     except ImportError:
         return []
-    rows: list[Row] = []
+    rows, seconds = list[Row](), list[float]()
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
         session = Path(folder, "session")
         save_scans(session, 1.0, scene, BATCH)
@@ -235,6 +236,11 @@ def _time_batches(scene: Any) -> list[Row]:
                 Client(cluster, set_as_default=False),
             ):
                 work = partial(batch, [session], "reconstruct", scheduler=cluster.scheduler_address)
-                rows.append(row(f"batch of {BATCH} captures, workers: {workers}", median(work, 1)))
-    rows[-1]["note"] = f"{rows[0]['ms'] / rows[-1]['ms']:.2f} times as fast as one"
+                seconds.append(median(work, 1))
+            cores = min(workers, numba.get_num_threads())
+            efficiency = seconds[0] / seconds[-1] / cores
+            note = f"efficiency {efficiency:.2f} on {cores} of the cores"
+            rows.append(
+                row(f"batch of {BATCH} captures, workers: {workers}", seconds[-1], note=note)
+            )
     return rows

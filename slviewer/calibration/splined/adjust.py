@@ -3,7 +3,6 @@ estimated from data."""
 
 from collections.abc import Callable, Sequence
 
-import numba
 import numpy as np
 import scipy
 from threadpoolctl import threadpool_limits
