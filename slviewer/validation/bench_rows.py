@@ -5,6 +5,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -308,8 +309,9 @@ class ReliefPair:
 
     def align(self) -> Floats:
         """Align by the program's registration, with its checks of the result."""
-        scan = prepare_scan("scan", self.moved, self.moved_normals)
-        reference = prepare_scan("reference", self.points, self.normals)
+        clouds = ("scan", self.moved, self.moved_normals), ("reference", self.points, self.normals)
+        with ThreadPoolExecutor() as threads:  # as `register_all` does
+            scan, reference = threads.map(lambda cloud: prepare_scan(*cloud), clouds)
         size, initial = min(scan.size, reference.size), Candidate(np.eye(4), "initial")
         return register_prepared(scan, reference, size, initial).T_reference_scan
 
