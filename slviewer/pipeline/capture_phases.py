@@ -338,16 +338,16 @@ def look_at_capture(capture: Capture) -> Look:
 
 
 def compute_ahead(
-    compute: Callable[[T], Computed], items: Sequence[T]
+    compute: Callable[[T], Computed], items: Sequence[T], at_once: int = 1
 ) -> Iterator[tuple[T, Future[Computed]]]:
-    """Yield items with what is computed of them, whose `result()` may raise; the next one's is
-    computed while one is processed."""
-    with ThreadPoolExecutor(1) as worker:
-        ahead = [worker.submit(compute, item) for item in items[:1]]
+    """Yield items with what is computed of them, whose `result()` may raise; the next ones',
+    ``at_once``, are computed while one is processed."""
+    with ThreadPoolExecutor(at_once) as worker:
+        ahead = [worker.submit(compute, item) for item in items[:at_once]]
         for i, item in enumerate(items):
-            computed = ahead.pop()
+            computed = ahead.pop(0)
             wait([computed])
-            ahead += [worker.submit(compute, following) for following in items[i + 1 : i + 2]]
+            ahead += [worker.submit(compute, each) for each in items[i + at_once :][:1]]
             yield item, computed
 
 

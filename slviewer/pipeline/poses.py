@@ -53,6 +53,8 @@ LINES_DEGREE = 5
 noise."""
 EVIDENCE_VERSION = 9
 """Version of the examination; evidence that was stored by another version is computed again."""
+POSES_AT_ONCE = 2
+"""Poses read side by side: most of the work on one occupies one thread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,17 +245,18 @@ def read_stored_poses(
             )
     cached = {name: load_judged(store, name, board, smoothing) for name in names}
     missing = [capture for capture in captures if cached[capture.name] is None]
-    ahead = compute_ahead(look_at_capture, missing)
+
+    def read(capture: Capture) -> Judged:
+        """Read a pose, which damaged frames refuse."""
+        try:
+            look = look_at_capture(capture)
+            return read_stored_pose(store, capture, look, board, smoothing, observed)
+        except DamagedError as error:
+            return Judged(capture.name, None, str(error).removeprefix(f"{capture.name}: "))
+
+    ahead = compute_ahead(read, missing, POSES_AT_ONCE)
     for name in names:
-        judged = cached[name]
-        if judged is None:
-            capture, look = next(ahead)
-            try:
-                judged = read_stored_pose(store, capture, look.result(), board, smoothing, observed)
-            except DamagedError as error:
-                judged = Judged(name, None, str(error).removeprefix(f"{name}: "))
-            del look  # before the next are waited for
-        yield judged
+        yield cached[name] or next(ahead)[1].result()
 
 
 def load_observations(store: Session, names: Sequence[str]) -> list[Observation]:
