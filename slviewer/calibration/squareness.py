@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from slviewer.calibration.board_pose import solve_device
 from slviewer.errors import InputError
@@ -121,7 +121,7 @@ def _fit_jackknife(systems: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Fl
         return np.zeros(len(total)), np.full(len(total), np.inf)
     count = len(systems)
     sigma = np.sqrt((count - 1) / count * np.sum(np.square(changes), axis=0))
-    return x, stats.t.isf(DOUBT / 2, count - 1) * sigma
+    return x, -stdtrit(count - 1, DOUBT / 2) * sigma
 
 
 def _explain_aspect(features: Sequence[tuple[Floats, Floats]], size: tuple[int, int]) -> float:

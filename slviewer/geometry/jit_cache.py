@@ -86,10 +86,9 @@ def _hash_source(module: str) -> tuple[bytes, tuple[str, ...]]:
 
 def _source_path(module: str) -> Path | None:
     """Return the source file of a module; None where there is none of that name."""
-    parts = PACKAGE.parent.joinpath(*module.split("."))
-    return next(
-        (path for path in (parts.with_suffix(".py"), parts / "__init__.py") if path.is_file()), None
-    )
+    place = os.path.join(PACKAGE.parent, *module.split("."))
+    files = f"{place}.py", os.path.join(place, "__init__.py")
+    return next((Path(file) for file in files if os.path.isfile(file)), None)
 
 
 @cache

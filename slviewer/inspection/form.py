@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.ndimage import uniform_filter
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, Uncertainty
@@ -135,7 +135,7 @@ def smooth_deviations(
     form = weights[removed.shape[1] :]
     draws = np.repeat(weights[:, None], DRAWS, axis=1)
     draws[removed.shape[1] :] = _draw_weights(form, degrees, noise, np.random.default_rng(0))
-    is_noise = bool(form @ form <= noise**2 * chi2.ppf(LEVEL, max(len(form), 1)))
+    is_noise = bool(form @ form <= noise**2 * chdtri(max(len(form), 1), 1 - LEVEL))
     return SmoothDeviations(
         points, normals, smooth, draws, is_noise, noise, unresolved, answer, sampled
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtri
 
 from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.geometry.rigid import Uncertainty, move_points
@@ -303,10 +303,10 @@ def process_capability(
     cp = None
     if np.isfinite(high - low):
         value = (high - low) / (6 * sigma)
-        ends = value * np.sqrt(chi2.ppf([tail, 1 - tail], n - 1) / (n - 1))
+        ends = value * np.sqrt(chdtri(n - 1, [1 - tail, tail]) / (n - 1))
         cp = (value, float(ends[0]), float(ends[1]))
     cpk = min(mean - low, high - mean) / (3 * sigma)
-    reach = float(norm.ppf(1 - tail) * np.sqrt(1 / (9 * n) + cpk**2 / (2 * (n - 1))))
+    reach = float(-ndtri(tail) * np.sqrt(1 / (9 * n) + cpk**2 / (2 * (n - 1))))
     return Capability(n, mean, sigma, cp, (cpk, cpk - reach, cpk + reach))
 
 

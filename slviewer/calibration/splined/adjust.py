@@ -44,6 +44,8 @@ LEAST_DAMPING, DAMPING_STEP, MOST_DAMPING = 1e-6, 10.0, 10.0
 limit."""
 CONVERGENCE_SIGMAS = 0.02
 """Largest RMS change of the predicted observations that is left at convergence, in sigmas."""
+NEAR_SIGMAS = 0.3
+"""Largest step near the solution, where the priors' strengths are updated."""
 STRENGTH_STEPS = 3
 """Number of updates of the priors' strengths, which converge after two."""
 MIN_SAMPLES = 3
@@ -148,12 +150,10 @@ def adjust_bundle(
             before, moved = moved, float(np.sqrt(max(float(move @ b), 0.0) / count))
             if progress:
                 progress(step / (step + 3))
-            if moved < 0.3 and updates < STRENGTH_STEPS:
+            if moved < NEAR_SIGMAS and updates < STRENGTH_STEPS:
                 prior = prior.update_strengths(state, factor.solve)
                 updates += 1
-            elif moved < CONVERGENCE_SIGMAS or (
-                updates == STRENGTH_STEPS and moved**2 < CONVERGENCE_SIGMAS * (before - moved)
-            ):  # further steps, each moved / before of the one before, sum to less
+            elif _remaining(before, moved) < CONVERGENCE_SIGMAS:
                 break
         else:
             raise CalibrationRejected(
@@ -269,6 +269,12 @@ def _take_step(
             return after, new, move, damping
         damping = max(DAMPING_STEP * damping, LEAST_DAMPING)
     return state, residuals, full, damping
+
+
+def _remaining(before: float, moved: float) -> float:
+    """Return the sum of the steps that follow one that ``moved``, each smaller by the ratio of that
+    to the step ``before``; ``moved`` where they do not shrink by half or are still large."""
+    return moved**2 / (before - moved) if moved < min(0.5 * before, NEAR_SIGMAS) else moved
 
 
 def _sigmas(
