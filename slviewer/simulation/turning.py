@@ -3,7 +3,6 @@
 from functools import lru_cache
 
 import numpy as np
-import trimesh
 
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.simulation.boards import Pose
@@ -64,6 +63,8 @@ def stone() -> tuple[np.ndarray, np.ndarray]:
     """A worn stone on a flat foot, watertight: vertices (n, 3) float64 mm with z up, triangles (m,
     3) int32 that are counter-clockwise seen from outside. About 120 mm wide, 90 mm high, without
     symmetry."""
+    import trimesh.creation  # takes 0.3 s
+
     ball = trimesh.creation.icosphere(_SUBDIVISIONS)
     directions, triangles = np.array(ball.vertices), np.array(ball.faces, np.int32)
     rng = np.random.default_rng(12)
