@@ -373,12 +373,13 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
     """Fill ``out`` (n, 2) with the centroids px of circles ``first`` to ``last``; others stay as
     they are.
 
-    ``gaps`` (n,): width px of the paper around each circle.
+    ``gaps`` (n,): width px of the paper around each circle. Loops over pixels, as whole-array
+    expressions take four times as long to compile.
     """
     height, width = image.shape
     for k in range(first, last):
-        u, v = centres[k]
-        (xx, xy), (_, yy) = covariances[k]
+        u, v = centres[k, 0], centres[k, 1]
+        xx, xy, yy = covariances[k, 0, 0], covariances[k, 0, 1], covariances[k, 1, 1]
         soft = min(EDGE_WIDTH_PX, 0.3 * gaps[k])
         end = min(EDGE_WIDTH_PX + RING_PX, gaps[k] - soft)
         far_u, far_v = 2 * np.sqrt(xx) + end + 1, 2 * np.sqrt(yy) + end + 1
@@ -389,8 +390,9 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
         u1, v1 = min(int(np.ceil(u + far_u)) + 1, width), min(int(np.ceil(v + far_v)) + 1, height)
         size = max(u1 - u0, 0) * max(v1 - v0, 0)
         place, level = np.empty((2, size)), np.empty(size)
-        within, ring, core = np.zeros((3, size), np.bool_)
-        i = 0
+        within, ring = np.zeros(size, np.bool_), np.zeros(size, np.bool_)
+        core = np.zeros(size, np.bool_)
+        i, in_ring, in_core = 0, 0, 0
         for row in range(v0, v1):
             for column in range(u0, u1):
                 du, dv = column - u, row - v
@@ -401,17 +403,24 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
                 place[0, i], place[1, i], level[i] = du, dv, image[row, column]
                 within[i], ring[i] = beyond < soft, soft < beyond < end
                 core[i] = radius < CORE_RADIUS
+                in_ring += ring[i]
+                in_core += core[i]
                 i += 1
-        if np.count_nonzero(ring) < MIN_RING_PIXELS or not core.any():
+        if in_ring < MIN_RING_PIXELS or in_core == 0:
             continue
-        ground = _fit_paper_level(place, level, ring, _quantile(level[core], 0.5))
+        ground = _fit_paper_level(place, level, ring, _quantile(level, core, 0.5))
         light = _fit_plane(place, level, core) if inverted else ground
-        paper, own = _plane_at(ground, place), np.maximum(_plane_at(light, place), 1.0)
-        ink = ((level - paper) / own if inverted else 1 - level / own)[within]
-        total = ink.sum()
+        total, along_u, along_v = 0.0, 0.0, 0.0
+        for i in range(size):
+            if within[i]:
+                own = max(_plane_at(light, place, i), 1.0)
+                paper = _plane_at(ground, place, i)
+                ink = (level[i] - paper) / own if inverted else 1 - level[i] / own
+                total += ink
+                along_u += ink * place[0, i]
+                along_v += ink * place[1, i]
         if total > 0.0:
-            out[k, 0] = u + (ink * place[0][within]).sum() / total
-            out[k, 1] = v + (ink * place[1][within]).sum() / total
+            out[k, 0], out[k, 1] = u + along_u / total, v + along_v / total
 
 
 @kernel()
@@ -423,29 +432,61 @@ def _fit_paper_level(place, level, ring, ink):
     the circle's own level ``ink`` and continues with the pixels within the noise of the plane.
     ``place`` (2, n) px from the circle's centre.
     """
-    plane = _fit_plane(place, level, ring)
-    levels = level[ring]
-    ground = _quantile(levels, 0.75 if ink < _quantile(levels, 0.5) else 0.25)
+    share = 0.75 if ink < _quantile(level, ring, 0.5) else 0.25
+    ground = _quantile(level, ring, share)
     contrast = abs(ground - ink)
-    off = np.abs(level - _plane_at(plane, place))
-    if off[ring].max() < FLATNESS * contrast:
-        return plane
-    near = ring & (np.abs(level - ground) < INITIAL_GATE * contrast)
-    for _ in range(2):
-        if np.count_nonzero(near) < MIN_RING_PIXELS:
+    off, near = np.empty_like(level), ring
+    plane = _fit_plane(place, level, ring)
+    for step in range(4):
+        worst = 0.0
+        for i in range(len(level)):
+            off[i] = abs(level[i] - _plane_at(plane, place, i))
+            if ring[i]:
+                worst = max(worst, off[i])
+        if step == 3 or (step == 0 and worst < FLATNESS * contrast):
+            return plane
+        gate = INITIAL_GATE * contrast
+        if step > 0:
+            gate = max(GATE_SIGMAS * 1.4826 * _quantile(off, near, 0.5), FLATNESS * contrast)
+        count, within = 0, np.empty_like(ring)
+        for i in range(len(level)):
+            is_near = (
+                abs(level[i] - ground) < INITIAL_GATE * contrast if step == 0 else off[i] < gate
+            )
+            within[i] = ring[i] and is_near
+            count += within[i]
+        near = within
+        if count < MIN_RING_PIXELS:
             return plane
         plane = _fit_plane(place, level, near)
-        off = np.abs(level - _plane_at(plane, place))
-        near = ring & (
-            off < max(GATE_SIGMAS * 1.4826 * _quantile(off[near], 0.5), FLATNESS * contrast)
-        )
-    return _fit_plane(place, level, near) if np.count_nonzero(near) >= MIN_RING_PIXELS else plane
+    return plane
 
 
 @kernel()
-def _quantile(values, share):
-    """Return a quantile of ``values`` (n,) without interpolation."""
-    return np.sort(values)[int(share * (len(values) - 1))]
+def _quantile(values, where, share):
+    """Return a quantile of the ``values`` (n,) at the places ``where`` (n,), without interpolation,
+    by Hoare's selection."""
+    chosen, last = np.empty_like(values), -1
+    for i in range(len(values)):
+        if where[i]:
+            last += 1
+            chosen[last] = values[i]
+    wanted, first = int(share * last), 0
+    while first < last:
+        pivot, i, j = chosen[wanted], first, last
+        while i <= j:
+            while chosen[i] < pivot:
+                i += 1
+            while chosen[j] > pivot:
+                j -= 1
+            if i <= j:
+                chosen[i], chosen[j] = chosen[j], chosen[i]
+                i, j = i + 1, j - 1
+        first = i if wanted >= i else first
+        last = j if wanted <= j else last
+        if j < wanted < i:
+            break
+    return chosen[wanted]
 
 
 @kernel()
@@ -455,11 +496,23 @@ def _fit_plane(place, level, where):
 
     Its slopes are 0 where the pixels are on one line.
     """
-    u, v, brightness = place[0][where], place[1][where], level[where]
-    mean_u, mean_v, mean = u.mean(), v.mean(), brightness.mean()
-    du, dv, dl = u - mean_u, v - mean_v, brightness - mean
-    uu, uv, vv = (du * du).sum(), (du * dv).sum(), (dv * dv).sum()
-    ul, vl = (du * dl).sum(), (dv * dl).sum()
+    count, mean_u, mean_v, mean = 0, 0.0, 0.0, 0.0
+    for i in range(len(level)):
+        if where[i]:
+            count += 1
+            mean_u += place[0, i]
+            mean_v += place[1, i]
+            mean += level[i]
+    mean_u, mean_v, mean = mean_u / count, mean_v / count, mean / count
+    uu, uv, vv, ul, vl = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(level)):
+        if where[i]:
+            du, dv, dl = place[0, i] - mean_u, place[1, i] - mean_v, level[i] - mean
+            uu += du * du
+            uv += du * dv
+            vv += dv * dv
+            ul += du * dl
+            vl += dv * dl
     determinant = uu * vv - uv * uv
     if not determinant > 1e-9 * uu * vv:
         return mean, 0.0, 0.0, mean_u, mean_v
@@ -468,6 +521,6 @@ def _fit_plane(place, level, where):
 
 
 @kernel()
-def _plane_at(plane, place):
-    """Return the levels (n,) of a plane at pixels ``place`` (2, n)."""
-    return plane[0] + plane[1] * (place[0] - plane[3]) + plane[2] * (place[1] - plane[4])
+def _plane_at(plane, place, i):
+    """Return the level of a plane at pixel ``i`` of ``place`` (2, n)."""
+    return plane[0] + plane[1] * (place[0, i] - plane[3]) + plane[2] * (place[1, i] - plane[4])
