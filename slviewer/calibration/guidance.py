@@ -475,7 +475,8 @@ def _fill_rows(state, points, frame, pixels, weights, at, rows):
     """
     work = allocate_workspace()
     columns = dense_columns(at)
-    columns[:POSE] = np.arange(POSE)
+    for c in range(POSE):
+        columns[c] = c
     for n in range(points.shape[0]):
         u, _ = feature_row(state, 0, points, frame, n, work)
         if np.isfinite(u):

@@ -5,6 +5,7 @@ import numpy as np
 
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.robust import median
 
 MAX_SAMPLES = 1024
 """Samples that a window may have; they are not more than 31 along either side."""
@@ -73,7 +74,9 @@ def _fit_windows(first, last, field, weight, pixels, radius, out):  # type: igno
         count = _collect_samples(field, weight, pixels[i, 0], pixels[i, 1], r, basis, value, base)
         if count < 30:
             continue
-        middle = np.median(value[:count])
+        for k in range(count):
+            robust[k] = value[k]
+        middle = median(robust, count)
         inliers = _fit_quadratic(count, middle, basis, value, base, robust, solution)
         if inliers >= 0.5 * count:
             out[i, 0], out[i, 1], out[i, 2] = solution[0] + middle, solution[1] / r, solution[2] / r
@@ -117,7 +120,8 @@ def _fit_quadratic(count, middle, basis, value, base, robust, solution):  # type
     returns the number of inliers.
     """
     residual = np.empty(count)
-    robust[:count] = 1.0
+    for k in range(count):
+        robust[k] = 1.0
     for _ in range(5):
         A, b = np.zeros((6, 6)), np.zeros(6)
         for k in range(count):
@@ -128,7 +132,7 @@ def _fit_quadratic(count, middle, basis, value, base, robust, solution):  # type
                     b[p] += wp * (value[k] - middle)
                     for q in range(p + 1):
                         A[p, q] += wp * basis[k, q]
-        trace = np.trace(A)
+        trace = A[0, 0] + A[1, 1] + A[2, 2] + A[3, 3] + A[4, 4] + A[5, 5]
         for p in range(6):
             A[p, p] += 1e-12 * trace
         _solve_spd(A, b, solution)
@@ -137,8 +141,12 @@ def _fit_quadratic(count, middle, basis, value, base, robust, solution):  # type
             for p in range(6):
                 fitted += basis[k, p] * solution[p]
             residual[k] = value[k] - middle - fitted
-        scale = 4.685 * 1.4826 * np.median(np.abs(residual)) + 1e-6
+            robust[k] = abs(residual[k])
+        scale = 4.685 * 1.4826 * median(robust, count) + 1e-6
         for k in range(count):
             t = residual[k] / scale
             robust[k] = (1 - t * t) ** 2 if abs(t) < 1 else 0.0
-    return np.count_nonzero(robust[:count] > 0.1)
+    inliers = 0
+    for k in range(count):
+        inliers += robust[k] > 0.1
+    return inliers

@@ -5,6 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
 
 Solution = TypeVar("Solution")
@@ -46,3 +47,36 @@ def fit_reweighted(
         if np.sqrt(np.mean((fitted - before) ** 2)) < 0.01 * sigma:
             break
     return solution
+
+
+@kernel()
+def select(values, count, wanted):
+    """Return what has the index ``wanted`` among the first ``count`` values (n,), sorted.
+
+    Hoare's selection, which reorders them; numba's sort and median take seconds to compile.
+    """
+    first, last = 0, count - 1
+    while first < last:
+        pivot, i, j = values[wanted], first, last
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if j < wanted < i:
+            break
+        if wanted >= i:
+            first = i
+        else:
+            last = j
+    return values[wanted]
+
+
+@kernel()
+def median(values, count):
+    """Return the median of the first ``count`` values (n,), which are reordered."""
+    upper = select(values, count, count // 2)
+    return upper if count % 2 else 0.5 * (upper + select(values, count, count // 2 - 1))

@@ -10,6 +10,7 @@ import numpy as np
 from slviewer.errors import BoardError, DetectionError
 from slviewer.geometry.jit import kernel, read_only, run_rows
 from slviewer.geometry.rigid import Floats, Floats32
+from slviewer.geometry.robust import select
 from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.target.blobs import Blobs, detect_blobs
 from slviewer.target.board import Board
@@ -464,29 +465,14 @@ def _fit_paper_level(place, level, ring, ink):
 
 @kernel()
 def _quantile(values, where, share):
-    """Return a quantile of the ``values`` (n,) at the places ``where`` (n,), without interpolation,
-    by Hoare's selection."""
-    chosen, last = np.empty_like(values), -1
+    """Return a quantile of the ``values`` (n,) at the places ``where`` (n,), without
+    interpolation."""
+    chosen, count = np.empty_like(values), 0
     for i in range(len(values)):
         if where[i]:
-            last += 1
-            chosen[last] = values[i]
-    wanted, first = int(share * last), 0
-    while first < last:
-        pivot, i, j = chosen[wanted], first, last
-        while i <= j:
-            while chosen[i] < pivot:
-                i += 1
-            while chosen[j] > pivot:
-                j -= 1
-            if i <= j:
-                chosen[i], chosen[j] = chosen[j], chosen[i]
-                i, j = i + 1, j - 1
-        first = i if wanted >= i else first
-        last = j if wanted <= j else last
-        if j < wanted < i:
-            break
-    return chosen[wanted]
+            chosen[count] = values[i]
+            count += 1
+    return select(chosen, count, int(share * (count - 1)))
 
 
 @kernel()

@@ -144,16 +144,17 @@ def _fill_rows(plane, axis, pixels, depths, at, values, columns):
     for n in range(depths.shape[0]):
         z = plane.t_board[0, 2] = depths[n]
         u, _ = sample_row(plane, 0, frame, pixels[n], work)
+        dx, dy, dz = values[n, 0], values[n, 1], values[n, 2]
         if not np.isfinite(u):
-            values[n] = np.nan
+            for c in range(dz.size):
+                dx[c] = dy[c] = dz[c] = np.nan
             continue
         fill_sample_fields(work)
         set_sample_columns(all_columns, plane.rig, work.cells, at)
-        columns[n] = all_columns[CAMERA:]
         x, y = work.local[0] / z, work.local[1] / z
         row = work.row[axis]
-        dx, dy, dz = values[n]
         for c in range(dz.size):
+            columns[n, c] = all_columns[CAMERA + c]
             dz[c] = -row[CAMERA + c] / row[HEIGHT - 1]  # over the change by a shift along z
             dx[c], dy[c] = x * dz[c], y * dz[c]
         for c in range(LENS):  # the ray changes too

@@ -249,4 +249,4 @@ def _tabulate(start, stop, rig, row, centre, near, far, step, grid, projected):
                 settled = abs(change) < 1e-3 or z in (first, last)
                 if settled and abs(correction) < MAX_CORRECTION * (last - first):
                     grid[j, i, k] = correction
-                    projected[j, i, k] = pu, pv
+                    projected[j, i, k, 0], projected[j, i, k, 1] = pu, pv

@@ -293,9 +293,11 @@ def _predict(first, last, state, data, features, samples):
     work = allocate_workspace()
     for i in range(first, last):
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
-            features[n] = feature_row(state, i, data.points, data.frame, data.feature[n], work)
+            features[n, 0], features[n, 1] = feature_row(
+                state, i, data.points, data.frame, data.feature[n], work
+            )
         for n in range(data.sample_from[i], data.sample_from[i + 1]):
-            samples[n] = sample_row(state, i, data.frame, data.sample_px[n], work)
+            samples[n, 0], samples[n, 1] = sample_row(state, i, data.frame, data.sample_px[n], work)
 
 
 @kernel()
@@ -336,17 +338,18 @@ def _add_features(state, pose, data, residuals, weights, work, sums):
 @kernel()
 def _add_samples(state, pose, data, part, residuals, weights, work, sums):
     """Add the samples of one ``pose``, whose indices are ``part`` (k,)."""
-    cells = np.full((2, 2), -1)
+    cells = -1, -1, -1, -1
     first = 0
     for n in part:
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
             sample_row(state, pose, data.frame, data.sample_px[n], work)
-            if not np.array_equal(work.cells, cells):
+            own = work.cells[0, 0], work.cells[0, 1], work.cells[1, 0], work.cells[1, 1]
+            if own != cells:
                 _add_rows(sums, ROW)
                 _move_sums(sums, ROW)
                 first = 0
-                cells[:] = work.cells
-                set_sample_columns(sums.columns, state.rig, cells, sums.at)
+                cells = own
+                set_sample_columns(sums.columns, state.rig, work.cells, sums.at)
             fill_sample_fields(work)
             _set_rows(sums, first, work.row, weights[n], residuals[n])
             if first == 2:
@@ -433,7 +436,8 @@ def _set_rows(sums, first, row, weight, residual):
     """Fill in rows ``first`` and ``first`` + 1 with the two of an observation, their weights and
     residuals."""
     for k in range(2):
-        sums.rows[first + k] = row[k]
+        for c in range(ROW):
+            sums.rows[first + k, c] = row[k, c]
         sums.w[first + k] = weight[k]
         sums.r[first + k] = residual[k] if weight[k] > 0.0 else 0.0
 
