@@ -41,7 +41,8 @@ MEGAPIXELS = (0.5, 2.0, 8.0, 24.0)
 WHOLE_MEGAPIXELS = (2.0, 8.0, 24.0)
 """Of captures that are read, decoded, reconstructed and written."""
 POSES = (10, 40, 200)
-SCANS = (3, 12, 50)
+SCANS = (6, 12, 25, 50)
+"""From five on, consecutive ones are registered, and two further pairs of each."""
 CAPTURES = (50, 200, 1000)
 WORKERS = (1, 2, 4)
 BATCH = 8
@@ -228,6 +229,12 @@ def _time_batches(scene: Any) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
         session = Path(folder, "session")
         save_scans(session, 1.0, scene, BATCH)
+
+        def reconstruct_all(scheduler: str) -> None:
+            """Reconstruct the batch. Raises InputError where one of its captures failed."""
+            if failed := batch([session], "reconstruct", scheduler=scheduler).failed:
+                raise InputError(f"the batch cannot be timed: {next(iter(failed.values()))}")
+
         for workers in WORKERS:
             with (
                 LocalCluster(
@@ -235,8 +242,7 @@ def _time_batches(scene: Any) -> list[Row]:
                 ) as cluster,
                 Client(cluster, set_as_default=False),
             ):
-                work = partial(batch, [session], "reconstruct", scheduler=cluster.scheduler_address)
-                seconds.append(median(work, 1))
+                seconds.append(median(partial(reconstruct_all, cluster.scheduler_address), 1))
             cores = min(workers, numba.get_num_threads())
             efficiency = seconds[0] / seconds[-1] / cores
             note = f"efficiency {efficiency:.2f} on {cores} of the cores"
