@@ -5,7 +5,7 @@ import numpy as np
 
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats
-from slviewer.geometry.robust import median
+from slviewer.geometry.robust import median_of
 
 MAX_SAMPLES = 1024
 """Samples that a window may have; they are not more than 31 along either side."""
@@ -76,7 +76,7 @@ def _fit_windows(first, last, field, weight, pixels, radius, out):  # type: igno
             continue
         for k in range(count):
             robust[k] = value[k]
-        middle = median(robust, count)
+        middle = median_of(robust, count)
         inliers = _fit_quadratic(count, middle, basis, value, base, robust, solution)
         if inliers >= 0.5 * count:
             out[i, 0], out[i, 1], out[i, 2] = solution[0] + middle, solution[1] / r, solution[2] / r
@@ -142,7 +142,7 @@ def _fit_quadratic(count, middle, basis, value, base, robust, solution):  # type
                 fitted += basis[k, p] * solution[p]
             residual[k] = value[k] - middle - fitted
             robust[k] = abs(residual[k])
-        scale = 4.685 * 1.4826 * median(robust, count) + 1e-6
+        scale = 4.685 * 1.4826 * median_of(robust, count) + 1e-6
         for k in range(count):
             t = residual[k] / scale
             robust[k] = (1 - t * t) ** 2 if abs(t) < 1 else 0.0

@@ -76,7 +76,7 @@ def select(values, count, wanted):
 
 
 @kernel()
-def median(values, count):
+def median_of(values, count):
     """Return the median of the first ``count`` values (n,), which are reordered."""
     upper = select(values, count, count // 2)
     return upper if count % 2 else 0.5 * (upper + select(values, count, count // 2 - 1))
