@@ -15,6 +15,7 @@ import numpy as np
 
 from slviewer.fringe.decoding_task import DecodingTask
 from slviewer.fringe.kernels import prefetch_row
+from slviewer.fringe.kernels_spikes import allocate_lists, mask_phases
 from slviewer.fringe.phase import Reason
 from slviewer.geometry.jit import kernel, read_only, run_rows, subtract_fixed_width
 
@@ -73,7 +74,7 @@ the same light."""
 def mask_indirect_light(task: DecodingTask, maps: Maps) -> None:
     """Mask, in place, the pixels of decoded ``maps`` whose frames contradict a single reflection;
     reason INDIRECT."""
-    layout, phase, reason = task.layout, maps[0], maps[-1]
+    layout = task.layout
     whites = [
         i
         for kind in ("texture", "white")
@@ -81,8 +82,7 @@ def mask_indirect_light(task: DecodingTask, maps: Maps) -> None:
         if frame.kind == kind
     ]
     if layout.steps >= FEWEST_STEPS and whites:
-        weak = _detect_weak_fringes(task, task.stack[whites[0]], maps)
-        reason.reshape(-1)[weak], phase.reshape(-1)[weak] = Reason.INDIRECT, np.nan
+        _mask_weak_fringes(task, task.stack[whites[0]], maps)
     if layout.gray:
         _mask_unequal_bits(task, maps)
 
@@ -233,9 +233,8 @@ def _mask_ranges(background, level, has_inverses, noise, ranges, phase, reason):
             phase[x], reason[x] = np.nan, INDIRECT
 
 
-def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps) -> np.ndarray:
-    """Return indices of the pixels (flattened) whose fringes are weak for their white light,
-    compared with the image's.
+def _mask_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps) -> None:
+    """Mask the pixels whose fringes are weak for their white light, compared with the image's.
 
     Of sharp fringes the amplitude is half of the white light. Blur makes them weaker: the
     projector's, which changes evenly over a depth range, and the camera's, by the square of the
@@ -252,22 +251,22 @@ def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps
     limits = np.array([task.white, *task.noise])
     sampled = _sample_strength(arrays, limits)
     if len(sampled) < FEWEST:
-        return np.zeros(0, np.int64)
+        return
     strength, terms = sampled[:, 0], sampled[:, 2:]
     fit, spread = _fit_strength(strength, terms)
     typical = float(np.exp(np.median(terms @ fit)))
     if not PLAUSIBLE[0] < typical < PLAUSIBLE[1] or spread > MOST_SPREAD:
-        return np.zeros(0, np.int64)
+        return
     margin = SPREADS * spread - np.log(1 - share)
     if is_narrow:
         # narrow fringes: the more unsharp they are, the more blur varies
         margin -= min(np.log(typical), 0.0)
-    weak, counts = np.empty(white_frame.shape, bool), np.empty(len(white_frame), np.int64)
-    run_rows(_select_candidates, len(weak), arrays, task.white, fit, margin, weak, counts)
-    if not counts.any():
-        return np.zeros(0, np.int64)
-    run_rows(_confirm_candidates, len(weak), arrays, limits, fit, margin, weak, counts)
-    return np.flatnonzero(weak)
+    candidates, weak = allocate_lists(white_frame.shape), allocate_lists(white_frame.shape)
+    height, fitted = len(white_frame), (fit, margin)
+    run_rows(_list_candidates, height, arrays, task.white, *fitted, candidates[0], candidates[2])
+    if candidates[2].any():
+        run_rows(_list_weak, height, arrays, limits, *fitted, candidates[0], candidates[2], *weak)
+        mask_phases(*weak, maps[0], maps[-1])
 
 
 def _sample_strength(arrays: Maps, limits: np.ndarray) -> np.ndarray:
@@ -278,7 +277,7 @@ def _sample_strength(arrays: Maps, limits: np.ndarray) -> np.ndarray:
     while True:
         rows, columns = (np.arange(step // 2, size, step) for size in (height, width))
         out = np.empty((len(rows), len(columns), 2 + len(PENALTIES)))
-        _measure_samples(arrays, limits, rows, columns, out)
+        run_rows(_measure_samples, len(rows), arrays, limits, rows, columns, out)
         out = out[np.isfinite(out[..., 0])]
         if len(out) >= SAMPLES / 8 or step == 1:
             return out
@@ -354,91 +353,103 @@ def _measure_strength(arrays, limits, i, x, out):
 
 
 @kernel()
-def _measure_samples(arrays, limits, rows, columns, out):
-    """Fill ``out`` (len(rows), len(columns), 8) as `_measure_strength` does."""
-    for k in range(len(rows)):
+def _measure_samples(first, last, arrays, limits, rows, columns, out):
+    """Fill ``out[first:last]`` (len(rows), len(columns), 8) as `_measure_strength` does."""
+    for k in range(first, last):
         for j in range(len(columns)):
             _measure_strength(arrays, limits, rows[k], columns[j], out[k, j])
 
 
 @kernel()
-def _select_candidates(first, last, arrays, white, fit, margin, candidates, counts):
-    """Set ``candidates`` (h, w) and their ``counts`` (h,) in a range of rows: where the fringes may
-    be weaker by the margin than the strongest that the fitted terms (6,) expect in a row.
+def _list_candidates(first, last, arrays, white, fit, margin, columns, counts):
+    """List, in a range of rows, where the fringes in WINDOW_PX pixels of the row may be weaker by
+    the margin than the strongest that the fitted terms (6,) expect in the rows nearby: in row v
+    ``counts[v]`` pixels, at ``columns[v]``.
 
-    Sums over windows follow from those of the row before.
+    A pixel whose fringes are weak is listed in one row of its window at least.
     """
     white_frame, phase, modulation, background, reason = arrays
     height, width = phase.shape
-    fringes = np.zeros((WINDOW_PX, width), np.float32)
-    light = np.zeros((WINDOW_PX, width), np.float32)
-    sums = np.zeros(width + 2 * REACH, np.float32), np.zeros(width + 2 * REACH, np.float32)
-    inner = sums[0][REACH:-REACH], sums[1][REACH:-REACH]
+    excess, is_weak = np.empty(width + 2 * REACH, np.float32), np.empty(width, np.uint8)
+    strongest = np.full(WINDOW_PX, -np.inf)
     for row in range(first - REACH, last + REACH):
-        v, slot = _reflect(row, height), (row + REACH) % WINDOW_PX
-        frames = white_frame[v], modulation[v], background[v], reason[v]
-        _replace_row(frames, np.float32(white), fringes[slot], light[slot], *inner)
+        is_inside = 0 <= row < height
+        strongest[row % WINDOW_PX] = (
+            _bound_strength(fit, row / height, phase[row]) if is_inside else -np.inf
+        )
         i = row - REACH
         if i < first:
             continue
-        for each in sums:
-            for k in range(REACH):
-                each[REACH - 1 - k] = each[REACH + k]
-                each[k - REACH] = each[-1 - k - REACH]
-        strongest = _bound_strength(fit, i / height, phase[i])
-        limit = np.float32(1.001 * np.exp(strongest - margin))
-        own = light[(i + REACH) % WINDOW_PX]
-        counts[i] = _compare_windows(*sums, limit, own, candidates[i])
+        limit = np.float32(1.001 * np.exp(strongest.max() - margin))
+        frames = white_frame[i], modulation[i], background[i], reason[i]
+        _measure_excess(frames, np.float32(white), limit, excess)
+        counts[i] = 0
+        if _compare_windows(excess, is_weak):
+            for x in range(width):
+                if is_weak[x]:
+                    columns[i, counts[i]] = x
+                    counts[i] += 1
 
 
 @kernel()
-def _confirm_candidates(first, last, arrays, limits, fit, margin, candidates, counts):
-    """Reset the ``candidates`` in a range of rows whose fringes are not weaker than the fitted
-    terms expect there by the margin and their noise."""
-    measured = np.empty(2 + len(fit))
+def _list_weak(
+    first, last, arrays, limits, fit, margin, columns, counts, weak, reasons, weak_counts
+):
+    """List in ``weak`` the pixels of a range of rows near candidates whose fringes are weaker than
+    the fitted terms expect there by the margin and their noise; ``reasons`` are INDIRECT."""
+    height, width = arrays[0].shape
+    measured, is_near = np.empty(2 + len(fit)), np.empty(width, np.bool_)
     for i in range(first, last):
-        if counts[i] == 0:
+        weak_counts[i] = 0
+        rows = range(max(i - REACH, 0), min(i + REACH + 1, height))
+        if not counts[rows.start : rows.stop].any():
             continue
-        for x in np.flatnonzero(candidates[i]):
+        is_near[:] = False
+        for v in rows:
+            for k in range(counts[v]):
+                is_near[columns[v, k]] = True
+        for x in np.flatnonzero(is_near):
             _measure_strength(arrays, limits, i, x, measured)
             expected = 0.0
             for k in range(len(fit)):
                 expected += fit[k] * measured[2 + k]
-            candidates[i, x] = measured[0] < expected - margin - measured[1]
+            if measured[0] < expected - margin - measured[1]:
+                weak[i, weak_counts[i]], reasons[i, weak_counts[i]] = x, INDIRECT
+                weak_counts[i] += 1
 
 
 @kernel()
-def _replace_row(frames, white, fringes, light, fringe_sums, light_sums):
-    """Replace a row's amplitudes and white light, (w,) each, in themselves and in their sums.
+def _measure_excess(frames, white, limit, excess):
+    """Fill ``excess`` (w + 6,), reflected at the image's borders: a row's amplitudes less ``limit``
+    times its white light.
 
     ``frames``: the row's white light, modulation, background and reason.
     """
     white_frame, modulation, background, reason = frames
+    inner = excess[REACH:-REACH]
     for x in range(len(modulation)):
         level = np.float32(white_frame[x])
         half = level - background[x]
         is_known = (reason[x] == 0) & (level < white) & (half > np.float32(0))
-        amplitude = modulation[x] if is_known else np.float32(0)
-        half = half if is_known else np.float32(0)
-        fringe_sums[x] += amplitude - fringes[x]
-        light_sums[x] += half - light[x]
-        fringes[x], light[x] = amplitude, half
+        inner[x] = modulation[x] - limit * half if is_known else np.float32(0)
+    for k in range(REACH):
+        excess[REACH - 1 - k] = excess[REACH + k]
+        excess[k - REACH] = excess[-1 - k - REACH]
 
 
 @kernel()
-def _compare_windows(fringes, light, limit, own, is_less):
-    """Set ``is_less`` (w,): where there is light of its ``own``, and the fringes in the window are
-    less than ``limit`` times its light; return the count. Both (w + 6,) are summed along columns.
-    """
-    count = 0
-    for x in range(len(is_less)):
-        weak, strong = fringes[x], light[x]
+def _compare_windows(excess, is_weak):
+    """Set ``is_weak`` (w,): where the ``excess`` (w + 6,) in the window is negative; return whether
+    it is anywhere."""
+    for x in range(len(is_weak)):
+        both = excess[x]
         for k in range(1, WINDOW_PX):
-            weak += fringes[x + k]
-            strong += light[x + k]
-        is_less[x] = (own[x] > np.float32(0)) & (weak < limit * strong)
-        count += is_less[x]
-    return count
+            both += excess[x + k]
+        is_weak[x] = both < np.float32(0)
+    found = np.uint8(0)
+    for each in is_weak:
+        found |= each
+    return found != 0
 
 
 @kernel()
