@@ -144,8 +144,8 @@ def _compare_bits(stack, first, frames, inverses, edges, noise, phase, backgroun
                 for x in range(width):
                     values[x] = frame[x]
             _extend_ranges(values, level, bits, grey(len(frames) - b), ranges)
-        if _do_ranges_differ(ranges, np.sqrt(noise[0]), reason[i]):
-            _mask_ranges(A, level, len(inverses) > 0, noise, ranges, phase[i], reason[i])
+        if _select_ranges(ranges, np.sqrt(noise[0]), reason[i], values):
+            _mask_ranges(values, A, level, len(inverses) > 0, noise, ranges, phase[i], reason[i])
 
 
 @kernel()
@@ -190,9 +190,9 @@ def _extend_ranges(values, level, bits, bit, ranges):
 
 
 @kernel()
-def _do_ranges_differ(ranges, sigma, reason):
-    """Return whether a pixel of a row may have unequal bits, for a grey level's standard deviation
-    of at least ``sigma``; False for most rows, in much less time than `_mask_ranges` takes."""
+def _select_ranges(ranges, sigma, reason, selected):
+    """Set ``selected`` (w,), not 0 where a pixel of a row may have unequal bits, for a grey level's
+    standard deviation of at least ``sigma``; return whether any may."""
     most, fewest, over_least, under_most = ranges
     grey = most.dtype.type
     largest = 32767.0 if most.itemsize == 2 else 127.0
@@ -205,20 +205,24 @@ def _do_ranges_differ(ranges, sigma, reason):
         # of white and black, one is half of the whole range at least
         whole = subtract_fixed_width(max(most[x], fewest[x]), fewest[x])
         is_wide = (spread >= max(least, grey(whole >> 2))) & (reason[x] == 0)
+        selected[x] = spread if is_wide else grey(0)
         found = max(found, spread if is_wide else grey(0))
     return found != 0
 
 
 @kernel()
-def _mask_ranges(background, level, has_inverses, noise, ranges, phase, reason):
-    """Mask the pixels of a row whose levels range over more than shares and noise allow, in white
-    or in black. Levels of inverses are twice their distance from the mean of black and white."""
+def _mask_ranges(selected, background, level, has_inverses, noise, ranges, phase, reason):
+    """Mask the ``selected`` pixels of a row whose levels range over more than shares and noise
+    allow, in white or in black. Levels of inverses are twice their distance from the mean of black
+    and white."""
     most, fewest, over_least, under_most = ranges
     a, b, zero = np.float32(noise[0]), np.float32(noise[1]), np.float32(0)
     share, sigmas = np.float32(BIT_SHARE), np.float32(BIT_SIGMAS)
     part = np.float32(0.5 if has_inverses else 1)
     base = np.float32(0 if has_inverses else 1)
     for x in range(len(reason)):
+        if selected[x] == 0:
+            continue
         middle = base * background[x]
         white = max((np.float32(most[x]) - middle) * part, zero)
         black = max((middle - np.float32(fewest[x])) * part, zero)
@@ -229,7 +233,7 @@ def _mask_ranges(background, level, has_inverses, noise, ranges, phase, reason):
         spread = max(range_white, range_black)
         variance = max(a + b * (background[x] + white), zero)
         is_unequal = (spread > share * max(white, black)) & (spread > sigmas * np.sqrt(variance))
-        if is_unequal and reason[x] == 0:
+        if is_unequal:
             phase[x], reason[x] = np.nan, INDIRECT
 
 
