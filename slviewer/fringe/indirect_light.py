@@ -14,7 +14,7 @@ nearly all of the image is like that, by nothing.
 import numpy as np
 
 from slviewer.fringe.decoding_task import DecodingTask
-from slviewer.fringe.kernels import prefetch_row
+from slviewer.fringe.kernels import ZERO, prefetch_row
 from slviewer.fringe.kernels_spikes import allocate_lists, mask_phases
 from slviewer.fringe.phase import Reason
 from slviewer.geometry.jit import kernel, read_only, run_rows, subtract_fixed_width
@@ -299,7 +299,7 @@ def _measure_light(arrays, white, i, x):
     """Return half of the white light of a pixel, in grey levels; 0 where it is unknown."""
     white_frame, _, _, background, reason = arrays
     light = np.float32(white_frame[i, x]) - background[i, x]
-    is_known = reason[i, x] == 0 and white_frame[i, x] < white and light > 0
+    is_known = (reason[i, x] == 0) & (white_frame[i, x] < white) & (light > 0)
     return light if is_known else np.float32(0)
 
 
@@ -334,14 +334,17 @@ def _measure_strength(arrays, limits, i, x, out):
         return
     half, fringes, count, slope, slopes = 0.0, 0.0, 0, 0.0, 0
     own_slope = _measure_square_gradient(phase, i, x)
-    for row in range(i - REACH, i + REACH + 1):
-        v = _reflect(row, height)
-        for column in range(x - REACH, x + REACH + 1):
-            u = _reflect(column, width)
+    for k in range(WINDOW_PX):
+        v = _reflect(i + k - REACH, height)
+        for j in range(WINDOW_PX):
+            u = _reflect(x + j - REACH, width)
             light = _measure_light(arrays, white, v, u)
-            if light > 0:
-                half, fringes, count = half + light, fringes + modulation[v, u], count + 1
-            if np.isnan(own_slope):
+            half, count = half + light, count + (light > 0)
+            fringes += modulation[v, u] if light > 0 else ZERO
+    if np.isnan(own_slope):
+        for k in range(WINDOW_PX):
+            for j in range(WINDOW_PX):
+                v, u = _reflect(i + k - REACH, height), _reflect(x + j - REACH, width)
                 square = _measure_square_gradient(phase, v, u)
                 if not np.isnan(square):
                     slope, slopes = slope + square, slopes + 1
