@@ -14,7 +14,7 @@ nearly all of the image is like that, by nothing.
 import numpy as np
 
 from slviewer.fringe.decoding_task import DecodingTask
-from slviewer.fringe.kernels import ZERO, prefetch_row
+from slviewer.fringe.kernels import prefetch_row
 from slviewer.fringe.kernels_spikes import allocate_lists, mask_phases
 from slviewer.fringe.phase import Reason
 from slviewer.geometry.jit import kernel, read_only, run_rows, subtract_fixed_width
@@ -340,7 +340,7 @@ def _measure_strength(arrays, limits, i, x, out):
             u = _reflect(x + j - REACH, width)
             light = _measure_light(arrays, white, v, u)
             half, count = half + light, count + (light > 0)
-            fringes += modulation[v, u] if light > 0 else ZERO
+            fringes += float(modulation[v, u]) if light > 0 else 0.0
     if np.isnan(own_slope):
         for k in range(WINDOW_PX):
             for j in range(WINDOW_PX):
