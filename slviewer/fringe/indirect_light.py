@@ -14,8 +14,10 @@ nearly all of the image is like that, by nothing.
 import numpy as np
 
 from slviewer.fringe.decoding_task import DecodingTask
+from slviewer.fringe.kernels import prefetch_row
+from slviewer.fringe.kernels_spikes import allocate_lists, mask_phases
 from slviewer.fringe.phase import Reason
-from slviewer.geometry.jit import kernel, read_only, run_rows
+from slviewer.geometry.jit import kernel, read_only, run_rows, subtract_fixed_width
 
 INDIRECT = np.uint8(Reason.INDIRECT)
 Maps = tuple[np.ndarray, ...]
@@ -24,9 +26,6 @@ BIT_SHARE = 0.65
 """Difference between the contrasts of a pixel's bits, as a share of the largest, up to which no bit
 is misread: that takes as much indirect light as direct. Adhesive tape on a board differs by up to a
 half, and is measured well."""
-UNSEEN = np.float32(1e9)
-CHUNK_PX = 512
-"""Pixels of a row that are compared at a time: what is computed of them fits a core's own cache."""
 BIT_SIGMAS = 8.0
 """... and in standard deviations of a grey level: noise alone does not make such a range."""
 EDGE_CELLS = 0.4
@@ -75,7 +74,7 @@ the same light."""
 def mask_indirect_light(task: DecodingTask, maps: Maps) -> None:
     """Mask, in place, the pixels of decoded ``maps`` whose frames contradict a single reflection;
     reason INDIRECT."""
-    layout, phase, reason = task.layout, maps[0], maps[-1]
+    layout = task.layout
     whites = [
         i
         for kind in ("texture", "white")
@@ -83,135 +82,163 @@ def mask_indirect_light(task: DecodingTask, maps: Maps) -> None:
         if frame.kind == kind
     ]
     if layout.steps >= FEWEST_STEPS and whites:
-        weak = _detect_weak_fringes(task, task.stack[whites[0]], maps)
-        reason.reshape(-1)[weak] = Reason.INDIRECT
+        _mask_weak_fringes(task, task.stack[whites[0]], maps)
     if layout.gray:
         _mask_unequal_bits(task, maps)
-    phase[reason == Reason.INDIRECT] = np.nan
 
 
 def _mask_unequal_bits(task: DecodingTask, maps: Maps) -> None:
-    """Set the reason INDIRECT where bits that have no edge near a pixel differ in black or
-    white."""
+    """Mask the pixels where bits that have no edge nearby differ in black or white."""
     layout, (phase, _, _, background, reason) = task.layout, maps
     count, cell = len(layout.gray), layout.gray_cell_px
     spans = [cell * 2.0 ** (count - bit) for bit in range(count)]
-    frames, inverses = list(layout.gray), list(layout.inverse) or [-1] * count
     guard = max(EDGE_CELLS * cell, EDGE_PX)
     wide = [k for k, span in enumerate(spans) if span > 4 * guard]
     if len(wide) < 2:
         return
-    bits = (
-        np.array([frames[k] for k in wide]),
-        np.array([inverses[k] for k in wide]),
-        np.array([spans[k] for k in wide]),
-    )
-    limits = np.array(
-        [layout.period_px / (2 * np.pi), layout.gray_origin_px, guard, *task.noise], np.float64
-    )
+    frames = np.array([layout.gray[k] for k in wide])
+    inverses = np.array([layout.inverse[k] for k in wide] if layout.inverse else [], np.int64)
+    spacing, to_px = spans[wide[-1]] / 2, layout.period_px / (2 * np.pi)
+    edges = np.array([to_px / spacing, layout.gray_origin_px / spacing, guard / spacing])
     stack = read_only(task.stack)
 
     def compare(first: int, last: int) -> None:
         """Compare the bits of a range of rows."""
-        _compare_bits(
-            stack, first, *bits, limits, *(each[first:last] for each in (phase, background, reason))
-        )
+        rows = (each[first:last] for each in (phase, background, reason))
+        _compare_bits(stack, first, frames, inverses, edges, task.noise, *rows)
 
     run_rows(compare, stack.shape[1])
 
 
 @kernel()
-def _compare_bits(stack, first, frames, inverses, spans, limits, phase, background, reason):
-    """Set the reason INDIRECT in rows from ``first`` on; the three maps contain only these rows."""
-    to_px, origin, guard, noise_a, noise_b = limits
-    edges, heights = np.empty(CHUNK_PX, np.int32), np.empty(CHUNK_PX, np.float32)
-    ranges = (
-        np.empty(CHUNK_PX, np.float32),
-        np.empty(CHUNK_PX, np.float32),
-        np.empty(CHUNK_PX, np.float32),
-        np.empty(CHUNK_PX, np.float32),
-    )
-    spacing = min(spans) / 2
-    bits = [np.int32(round(span / (2 * spacing))) for span in spans]
-    for i in range(len(phase)):
-        for begin in range(0, phase.shape[1], CHUNK_PX):
-            chunk = slice(begin, begin + CHUNK_PX)
-            ranges[0][:], ranges[1][:], ranges[2][:], ranges[3][:] = 0, UNSEEN, 0, UNSEEN
-            level = background[i, chunk]
-            _number_edges(phase[i, chunk], to_px, origin, spacing, guard, edges)
-            for b in range(len(frames)):
-                frame = stack[frames[b], first + i, chunk]
-                inverse = stack[max(inverses[b], 0), first + i, chunk]
-                _measure_heights(frame, inverse, inverses[b] >= 0, level, heights)
-                _extend_ranges(edges, heights, bits[b], len(level), ranges)
-            _mask_ranges(level, noise_a, noise_b, ranges, reason[i, chunk])
+def _compare_bits(stack, first, frames, inverses, edges, noise, phase, background, reason):
+    """Mask pixels in rows from ``first`` on; the three maps contain only these rows.
 
-
-@kernel()
-def _number_edges(phase, to_px, origin, spacing, guard, edges):
-    """Fill ``edges`` with the number of the edge that a pixel is within ``guard`` px of, counted
-    from the code's origin; 0 where there is none.
-
-    Edges of all bits are ``spacing`` px apart, more than twice the guard.
+    ``frames``: bits, most significant first; ``inverses``: of these, or none; ``edges`` as
+    `_number_bits` has them.
     """
-    scale, offset = np.float32(to_px / spacing), np.float32(origin / spacing)
-    share = np.float32(guard / spacing)
+    width, grey = phase.shape[1], stack.dtype.type
+    full = grey(65535 if stack.itemsize == 2 else 255)
+    place = np.empty(width, np.float32)
+    level, bits = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
+    values, most = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
+    fewest, over_least = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
+    under_most = np.empty(width, stack.dtype)
+    ranges = most, fewest, over_least, under_most
+    for i in range(len(phase)):
+        A = background[i]
+        _number_bits(phase[i], edges, place, bits)
+        for x in range(width):
+            level[x] = grey(0) if len(inverses) else grey(np.int32(A[x]))
+            most[x] = under_most[x] = grey(0)
+            fewest[x] = over_least[x] = full
+        for b in range(len(frames)):
+            frame = stack[frames[b], first + i]
+            inverse = stack[inverses[b] if len(inverses) else frames[b], first + i]
+            prefetch_row(stack, frames[b], first + i)
+            if len(inverses):
+                prefetch_row(stack, inverses[b], first + i)
+                for x in range(width):
+                    values[x] = max(frame[x], inverse[x]) - min(frame[x], inverse[x])
+            else:
+                for x in range(width):
+                    values[x] = frame[x]
+            _extend_ranges(values, level, bits, grey(len(frames) - b), ranges)
+        if _select_ranges(ranges, np.sqrt(noise[0]), reason[i], values):
+            _mask_ranges(values, A, level, len(inverses) > 0, noise, ranges, phase[i], reason[i])
+
+
+@kernel()
+def _number_bits(phase, edges, place, bits):
+    """Fill ``bits`` with the number of the bit, 1 for the least, an edge of which is near a pixel;
+    0 where there is none.
+
+    ``edges``: how many there are in a rad, how many the code's origin is from phase 0, and the
+    share of their distance, less than half, that is near. Counted from the origin, bit k has those
+    whose numbers are odd multiples of 2^(k - 1). ``place`` (w,) float32 is a buffer.
+    """
+    scale, offset, share = np.float32(edges[0]), np.float32(edges[1]), np.float32(edges[2])
     for x in range(len(phase)):
-        place = phase[x] * scale - offset
-        nearest = np.floor(place + np.float32(0.5))
+        at = phase[x] * scale - offset
+        nearest = np.floor(at + np.float32(0.5))
         # false for NaN as well
-        edges[x] = np.int32(nearest if abs(place - nearest) < share else np.float32(0))
+        edge = np.int32(nearest if abs(at - nearest) < share else np.float32(0))
+        place[x] = np.float32(np.int32(edge & np.int32(-edge)))  # its last binary 1
+    exponents = place.view(np.int32)
+    for x in range(len(phase)):
+        bits[x] = max(np.int32(np.int32(exponents[x] >> 23) - np.int32(126)), np.int32(0))
 
 
 @kernel()
-def _measure_heights(frame, inverse, has_inverse, background, heights):
-    """Fill ``heights``: levels of a bit above black and white's mean, which the inverse, if there
-    is one, or the background shows."""
-    if has_inverse:
-        for x in range(len(frame)):
-            heights[x] = abs(np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
-    else:
-        for x in range(len(frame)):
-            heights[x] = np.float32(frame[x]) - background[x]
+def _extend_ranges(values, level, bits, bit, ranges):
+    """Extend the ranges of levels by a bit's ``values`` where it has no edge: the largest, the
+    least, the least above ``level``, and the largest that is not above it.
 
-
-@kernel()
-def _extend_ranges(edges, heights, bit, count, ranges):
-    """Extend the ranges of ``count`` levels, most and least of white and of black, by those of a
-    bit where it has no edge: of those that are numbered by ``bit`` and its odd multiples."""
-    most_white, least_white, most_black, least_black = ranges
-    digits, none = np.int32(2 * bit - 1), np.float32(0)
-    for x in range(count):
-        is_far = (edges[x] & digits) != bit
-        height = heights[x] if is_far else none
-        some_white = height if height > none else UNSEEN
-        some_black = -height if is_far & (height <= none) else UNSEEN
+    The frames' own numbers are compared, of which most fit a vector register.
+    """
+    most, fewest, over_least, under_most = ranges
+    grey = values.dtype.type
+    none, full = grey(0), grey(65535 if values.itemsize == 2 else 255)
+    for x in range(len(values)):
+        is_far, is_over = bits[x] != bit, values[x] > level[x]
+        low, high = values[x] if is_far else full, values[x] if is_far else none
         # all are read before one is written: else the compiler takes them one by one
-        a, b, c, d = most_white[x], least_white[x], most_black[x], least_black[x]
-        most_white[x] = height if height > a else a
-        least_white[x] = some_white if some_white < b else b
-        most_black[x] = -height if -height > c else c
-        least_black[x] = some_black if some_black < d else d
+        a, b, c, d = most[x], fewest[x], over_least[x], under_most[x]
+        most[x], fewest[x] = max(a, high), min(b, low)
+        over_least[x] = min(c, low if is_over else full)
+        under_most[x] = max(d, none if is_over else high)
 
 
 @kernel()
-def _mask_ranges(background, noise_a, noise_b, ranges, reason):
-    """Set the reason INDIRECT where a row's levels, most and least of white and of black, range
-    over more than shares and noise allow."""
-    most_white, least_white, most_black, least_black = ranges
-    a, b = np.float32(noise_a), np.float32(noise_b)
-    share, sigmas = np.float32(BIT_SHARE), np.float32(BIT_SIGMAS)
+def _select_ranges(ranges, sigma, reason, selected):
+    """Set ``selected`` (w,), not 0 where a pixel of a row may have unequal bits, for a grey level's
+    standard deviation of at least ``sigma``; return whether any may."""
+    most, fewest, over_least, under_most = ranges
+    grey = most.dtype.type
+    largest = 32767.0 if most.itemsize == 2 else 127.0
+    least, found = grey(min(BIT_SIGMAS * sigma, largest)), grey(0)
     for x in range(len(reason)):
-        white, black = most_white[x], most_black[x]
-        spread = max(white - least_white[x], black - least_black[x])
-        variance = max(a + b * (background[x] + white), np.float32(0))
+        # at least 0 where no bit is white, or black
+        white = subtract_fixed_width(max(most[x], over_least[x]), over_least[x])
+        black = subtract_fixed_width(max(under_most[x], fewest[x]), fewest[x])
+        spread = max(white, black)
+        # of white and black, one is half of the whole range at least
+        whole = subtract_fixed_width(max(most[x], fewest[x]), fewest[x])
+        is_wide = (spread >= max(least, grey(whole >> 2))) & (reason[x] == 0)
+        selected[x] = spread if is_wide else grey(0)
+        found = max(found, spread if is_wide else grey(0))
+    return found != 0
+
+
+@kernel()
+def _mask_ranges(selected, background, level, has_inverses, noise, ranges, phase, reason):
+    """Mask the ``selected`` pixels of a row whose levels range over more than shares and noise
+    allow, in white or in black. Levels of inverses are twice their distance from the mean of black
+    and white."""
+    most, fewest, over_least, under_most = ranges
+    a, b, zero = np.float32(noise[0]), np.float32(noise[1]), np.float32(0)
+    share, sigmas = np.float32(BIT_SHARE), np.float32(BIT_SIGMAS)
+    part = np.float32(0.5 if has_inverses else 1)
+    base = np.float32(0 if has_inverses else 1)
+    for x in range(len(reason)):
+        if selected[x] == 0:
+            continue
+        middle = base * background[x]
+        white = max((np.float32(most[x]) - middle) * part, zero)
+        black = max((middle - np.float32(fewest[x])) * part, zero)
+        least_white = (np.float32(over_least[x]) - middle) * part
+        least_black = (middle - np.float32(under_most[x])) * part
+        range_white = white - least_white if most[x] > level[x] else zero
+        range_black = black - least_black if fewest[x] <= level[x] else zero
+        spread = max(range_white, range_black)
+        variance = max(a + b * (background[x] + white), zero)
         is_unequal = (spread > share * max(white, black)) & (spread > sigmas * np.sqrt(variance))
-        reason[x] = INDIRECT if is_unequal & (reason[x] == 0) else reason[x]
+        if is_unequal:
+            phase[x], reason[x] = np.nan, INDIRECT
 
 
-def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps) -> np.ndarray:
-    """Return indices of the pixels (flattened) whose fringes are weak for their white light,
-    compared with the image's.
+def _mask_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps) -> None:
+    """Mask the pixels whose fringes are weak for their white light, compared with the image's.
 
     Of sharp fringes the amplitude is half of the white light. Blur makes them weaker: the
     projector's, which changes evenly over a depth range, and the camera's, by the square of the
@@ -228,22 +255,22 @@ def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps
     limits = np.array([task.white, *task.noise])
     sampled = _sample_strength(arrays, limits)
     if len(sampled) < FEWEST:
-        return np.zeros(0, np.int64)
+        return
     strength, terms = sampled[:, 0], sampled[:, 2:]
     fit, spread = _fit_strength(strength, terms)
     typical = float(np.exp(np.median(terms @ fit)))
     if not PLAUSIBLE[0] < typical < PLAUSIBLE[1] or spread > MOST_SPREAD:
-        return np.zeros(0, np.int64)
+        return
     margin = SPREADS * spread - np.log(1 - share)
     if is_narrow:
         # narrow fringes: the more unsharp they are, the more blur varies
         margin -= min(np.log(typical), 0.0)
-    weak, counts = np.empty(white_frame.shape, bool), np.empty(len(white_frame), np.int64)
-    run_rows(_select_candidates, len(weak), arrays, task.white, fit, margin, weak, counts)
-    if not counts.any():
-        return np.zeros(0, np.int64)
-    run_rows(_confirm_candidates, len(weak), arrays, limits, fit, margin, weak, counts)
-    return np.flatnonzero(weak)
+    candidates, weak = allocate_lists(white_frame.shape), allocate_lists(white_frame.shape)
+    height, fitted = len(white_frame), (fit, margin)
+    run_rows(_list_candidates, height, arrays, task.white, *fitted, candidates[0], candidates[2])
+    if candidates[2].any():
+        run_rows(_list_weak, height, arrays, limits, *fitted, candidates[0], candidates[2], *weak)
+        mask_phases(*weak, maps[0], maps[-1])
 
 
 def _sample_strength(arrays: Maps, limits: np.ndarray) -> np.ndarray:
@@ -254,7 +281,7 @@ def _sample_strength(arrays: Maps, limits: np.ndarray) -> np.ndarray:
     while True:
         rows, columns = (np.arange(step // 2, size, step) for size in (height, width))
         out = np.empty((len(rows), len(columns), 2 + len(PENALTIES)))
-        _measure_samples(arrays, limits, rows, columns, out)
+        run_rows(_measure_samples, len(rows), arrays, limits, rows, columns, out)
         out = out[np.isfinite(out[..., 0])]
         if len(out) >= SAMPLES / 8 or step == 1:
             return out
@@ -272,7 +299,7 @@ def _measure_light(arrays, white, i, x):
     """Return half of the white light of a pixel, in grey levels; 0 where it is unknown."""
     white_frame, _, _, background, reason = arrays
     light = np.float32(white_frame[i, x]) - background[i, x]
-    is_known = reason[i, x] == 0 and white_frame[i, x] < white and light > 0
+    is_known = (reason[i, x] == 0) & (white_frame[i, x] < white) & (light > 0)
     return light if is_known else np.float32(0)
 
 
@@ -307,14 +334,17 @@ def _measure_strength(arrays, limits, i, x, out):
         return
     half, fringes, count, slope, slopes = 0.0, 0.0, 0, 0.0, 0
     own_slope = _measure_square_gradient(phase, i, x)
-    for row in range(i - REACH, i + REACH + 1):
-        v = _reflect(row, height)
-        for column in range(x - REACH, x + REACH + 1):
-            u = _reflect(column, width)
+    for k in range(WINDOW_PX):
+        v = _reflect(i + k - REACH, height)
+        for j in range(WINDOW_PX):
+            u = _reflect(x + j - REACH, width)
             light = _measure_light(arrays, white, v, u)
-            if light > 0:
-                half, fringes, count = half + light, fringes + modulation[v, u], count + 1
-            if np.isnan(own_slope):
+            half, count = half + light, count + (light > 0)
+            fringes += float(modulation[v, u]) if light > 0 else 0.0
+    if np.isnan(own_slope):
+        for k in range(WINDOW_PX):
+            for j in range(WINDOW_PX):
+                v, u = _reflect(i + k - REACH, height), _reflect(x + j - REACH, width)
                 square = _measure_square_gradient(phase, v, u)
                 if not np.isnan(square):
                     slope, slopes = slope + square, slopes + 1
@@ -330,91 +360,103 @@ def _measure_strength(arrays, limits, i, x, out):
 
 
 @kernel()
-def _measure_samples(arrays, limits, rows, columns, out):
-    """Fill ``out`` (len(rows), len(columns), 8) as `_measure_strength` does."""
-    for k in range(len(rows)):
+def _measure_samples(first, last, arrays, limits, rows, columns, out):
+    """Fill ``out[first:last]`` (len(rows), len(columns), 8) as `_measure_strength` does."""
+    for k in range(first, last):
         for j in range(len(columns)):
             _measure_strength(arrays, limits, rows[k], columns[j], out[k, j])
 
 
 @kernel()
-def _select_candidates(first, last, arrays, white, fit, margin, candidates, counts):
-    """Set ``candidates`` (h, w) and their ``counts`` (h,) in a range of rows: where the fringes may
-    be weaker by the margin than the strongest that the fitted terms (6,) expect in a row.
+def _list_candidates(first, last, arrays, white, fit, margin, columns, counts):
+    """List, in a range of rows, where the fringes in WINDOW_PX pixels of the row may be weaker by
+    the margin than the strongest that the fitted terms (6,) expect in the rows nearby: in row v
+    ``counts[v]`` pixels, at ``columns[v]``.
 
-    Sums over windows follow from those of the row before.
+    A pixel whose fringes are weak is listed in one row of its window at least.
     """
     white_frame, phase, modulation, background, reason = arrays
     height, width = phase.shape
-    fringes = np.zeros((WINDOW_PX, width), np.float32)
-    light = np.zeros((WINDOW_PX, width), np.float32)
-    sums = np.zeros(width + 2 * REACH, np.float32), np.zeros(width + 2 * REACH, np.float32)
-    inner = sums[0][REACH:-REACH], sums[1][REACH:-REACH]
+    excess, is_weak = np.empty(width + 2 * REACH, np.float32), np.empty(width, np.uint8)
+    strongest = np.full(WINDOW_PX, -np.inf)
     for row in range(first - REACH, last + REACH):
-        v, slot = _reflect(row, height), (row + REACH) % WINDOW_PX
-        frames = white_frame[v], modulation[v], background[v], reason[v]
-        _replace_row(frames, np.float32(white), fringes[slot], light[slot], *inner)
+        is_inside = 0 <= row < height
+        strongest[row % WINDOW_PX] = (
+            _bound_strength(fit, row / height, phase[row]) if is_inside else -np.inf
+        )
         i = row - REACH
         if i < first:
             continue
-        for each in sums:
-            for k in range(REACH):
-                each[REACH - 1 - k] = each[REACH + k]
-                each[k - REACH] = each[-1 - k - REACH]
-        strongest = _bound_strength(fit, i / height, phase[i])
-        limit = np.float32(1.001 * np.exp(strongest - margin))
-        own = light[(i + REACH) % WINDOW_PX]
-        counts[i] = _compare_windows(*sums, limit, own, candidates[i])
+        limit = np.float32(1.001 * np.exp(strongest.max() - margin))
+        frames = white_frame[i], modulation[i], background[i], reason[i]
+        _measure_excess(frames, np.float32(white), limit, excess)
+        counts[i] = 0
+        if _compare_windows(excess, is_weak):
+            for x in range(width):
+                if is_weak[x]:
+                    columns[i, counts[i]] = x
+                    counts[i] += 1
 
 
 @kernel()
-def _confirm_candidates(first, last, arrays, limits, fit, margin, candidates, counts):
-    """Reset the ``candidates`` in a range of rows whose fringes are not weaker than the fitted
-    terms expect there by the margin and their noise."""
-    measured = np.empty(2 + len(fit))
+def _list_weak(
+    first, last, arrays, limits, fit, margin, columns, counts, weak, reasons, weak_counts
+):
+    """List in ``weak`` the pixels of a range of rows near candidates whose fringes are weaker than
+    the fitted terms expect there by the margin and their noise; ``reasons`` are INDIRECT."""
+    height, width = arrays[0].shape
+    measured, is_near = np.empty(2 + len(fit)), np.empty(width, np.bool_)
     for i in range(first, last):
-        if counts[i] == 0:
+        weak_counts[i] = 0
+        rows = range(max(i - REACH, 0), min(i + REACH + 1, height))
+        if not counts[rows.start : rows.stop].any():
             continue
-        for x in np.flatnonzero(candidates[i]):
+        is_near[:] = False
+        for v in rows:
+            for k in range(counts[v]):
+                is_near[columns[v, k]] = True
+        for x in np.flatnonzero(is_near):
             _measure_strength(arrays, limits, i, x, measured)
             expected = 0.0
             for k in range(len(fit)):
                 expected += fit[k] * measured[2 + k]
-            candidates[i, x] = measured[0] < expected - margin - measured[1]
+            if measured[0] < expected - margin - measured[1]:
+                weak[i, weak_counts[i]], reasons[i, weak_counts[i]] = x, INDIRECT
+                weak_counts[i] += 1
 
 
 @kernel()
-def _replace_row(frames, white, fringes, light, fringe_sums, light_sums):
-    """Replace a row's amplitudes and white light, (w,) each, in themselves and in their sums.
+def _measure_excess(frames, white, limit, excess):
+    """Fill ``excess`` (w + 6,), reflected at the image's borders: a row's amplitudes less ``limit``
+    times its white light.
 
     ``frames``: the row's white light, modulation, background and reason.
     """
     white_frame, modulation, background, reason = frames
+    inner = excess[REACH:-REACH]
     for x in range(len(modulation)):
         level = np.float32(white_frame[x])
         half = level - background[x]
         is_known = (reason[x] == 0) & (level < white) & (half > np.float32(0))
-        amplitude = modulation[x] if is_known else np.float32(0)
-        half = half if is_known else np.float32(0)
-        fringe_sums[x] += amplitude - fringes[x]
-        light_sums[x] += half - light[x]
-        fringes[x], light[x] = amplitude, half
+        inner[x] = modulation[x] - limit * half if is_known else np.float32(0)
+    for k in range(REACH):
+        excess[REACH - 1 - k] = excess[REACH + k]
+        excess[k - REACH] = excess[-1 - k - REACH]
 
 
 @kernel()
-def _compare_windows(fringes, light, limit, own, is_less):
-    """Set ``is_less`` (w,): where there is light of its ``own``, and the fringes in the window are
-    less than ``limit`` times its light; return the count. Both (w + 6,) are summed along columns.
-    """
-    count = 0
-    for x in range(len(is_less)):
-        weak, strong = fringes[x], light[x]
+def _compare_windows(excess, is_weak):
+    """Set ``is_weak`` (w,): where the ``excess`` (w + 6,) in the window is negative; return whether
+    it is anywhere."""
+    for x in range(len(is_weak)):
+        both = excess[x]
         for k in range(1, WINDOW_PX):
-            weak += fringes[x + k]
-            strong += light[x + k]
-        is_less[x] = (own[x] > np.float32(0)) & (weak < limit * strong)
-        count += is_less[x]
-    return count
+            both += excess[x + k]
+        is_weak[x] = both < np.float32(0)
+    found = np.uint8(0)
+    for each in is_weak:
+        found |= each
+    return found != 0
 
 
 @kernel()

@@ -34,6 +34,8 @@ EDGE, FAR_EDGE, WHOLE = (
 )
 WINDOW, MAJORITY, NEIGHBOURS = limits.WINDOW, limits.SPIKE_MAJORITY, limits.SPIKE_NEIGHBOURS
 LONELY, LONELY_NEIGHBOURS = limits.LONELY, limits.LONELY_NEIGHBOURS
+ENOUGH = math.ceil(LONELY * ((2 * WINDOW + 1) ** 2 - 1))
+"""Neighbours that agree with a pixel, which is not lonely however many others are valid."""
 RUN = 8
 """Pixels that are passed over together where none is examined: their marks are one word."""
 
@@ -102,24 +104,47 @@ def is_suspect(phase, row, x, per_cell):
 
 
 @numba.njit(inline="always")
+def measure_cells(other, own, per_cell, rules):
+    """Return the cells by which a phase is above a pixel's ``own``; NaN where either is."""
+    cells = (other - own) * per_cell
+    if rules.repeat < math.inf:
+        repeats = round(cells * np.float32(1 / rules.repeat))
+        cells -= np.float32(rules.repeat) * np.float32(repeats)
+    return cells
+
+
+@numba.njit(inline="always")
 def count_votes(phase, row, x, rules):
-    """Count the neighbours in a pixel's window that are valid, that agree, and that are a cell
-    above or below it."""
+    """Count the neighbours in a pixel's window that are valid, and that are a cell above or below
+    it."""
     height, width = phase.shape
     per_cell, own = np.float32(1 / rules.cell_rad), phase[row, x]
-    valid, agreeing, above, below = -1, -1, 0, 0  # the pixel itself is valid, and agrees
+    valid, above, below = -1, 0, 0  # the pixel itself is valid
     for v in range(max(0, row - WINDOW), min(height, row + WINDOW + 1)):
         for u in range(max(0, x - WINDOW), min(width, x + WINDOW + 1)):
-            cells = (phase[v, u] - own) * per_cell
-            if rules.repeat < math.inf:
-                cells -= np.float32(rules.repeat) * np.float32(
-                    round(cells * np.float32(1 / rules.repeat))
-                )
+            cells = measure_cells(phase[v, u], own, per_cell, rules)
             valid += cells == cells  # not NaN
-            agreeing += abs(cells) <= HALF
             above += abs(cells - ONE) < WHOLE
             below += abs(cells + ONE) < WHOLE
-    return valid, agreeing, above, below
+    return valid, above, below
+
+
+@numba.njit(inline="always")
+def is_lonely(phase, row, x, rules):
+    """Return whether too few neighbours in a pixel's window are valid, or agree with it."""
+    height, width = phase.shape
+    per_cell, own = np.float32(1 / rules.cell_rad), phase[row, x]
+    valid, agreeing = 0, 0
+    for v in range(max(0, row - WINDOW), min(height, row + WINDOW + 1)):
+        for du in range(-WINDOW, WINDOW + 1):  # so many always: the compiler unrolls the loop
+            u = x + du
+            other = phase[v, u] if u >= 0 and u < width else INVALID
+            cells = measure_cells(other, own, per_cell, rules)
+            valid += cells == cells  # not NaN
+            agreeing += abs(cells) <= HALF
+        if agreeing - (v >= row) >= ENOUGH:  # less the pixel itself
+            return False
+    return valid - 1 < LONELY_NEIGHBOURS or agreeing - 1 < LONELY * (valid - 1)
 
 
 @numba.njit
@@ -133,7 +158,7 @@ def period_change(phase, row, x, rules):
     part = part - np.float32(math.floor(part))
     if part >= EDGE and part < FAR_EDGE:
         return UNCHANGED
-    valid, _, above, below = count_votes(phase, row, x, rules)
+    valid, above, below = count_votes(phase, row, x, rules)
     if valid < NEIGHBOURS:
         return UNCHANGED
     if above >= MAJORITY * valid:
@@ -145,10 +170,8 @@ def period_change(phase, row, x, rules):
 def masking_reason(phase, row, x, suspect, rules):
     """Return the reason to mask a pixel, or UNCHANGED; neighbours vote only where one is
     ``suspect``."""
-    if suspect:
-        valid, agreeing, _, _ = count_votes(phase, row, x, rules)
-        if valid < LONELY_NEIGHBOURS or agreeing < LONELY * valid:
-            return INCONSISTENT
+    if suspect and is_lonely(phase, row, x, rules):
+        return INCONSISTENT
     is_outside = phase[row, x] < np.float32(rules.low_rad) or phase[row, x] > np.float32(
         rules.high_rad
     )
@@ -203,7 +226,9 @@ def _list_row(phase, row, rules, masking, columns, words, runs):
         for x in range(RUN * run, min(RUN * run + RUN, width)):
             if examined[x]:
                 if masking:
-                    word = masking_reason(phase, row, x, is_suspect(phase, row, x, per_cell), rules)
+                    is_inside = phase[row, x] >= low and phase[row, x] <= high
+                    suspect = is_inside or is_suspect(phase, row, x, per_cell)
+                    word = masking_reason(phase, row, x, suspect, rules)
                 else:
                     word = period_change(phase, row, x, rules)
                 if word != UNCHANGED:

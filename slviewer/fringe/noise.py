@@ -61,16 +61,17 @@ def _compute_mean_variance(bins: tuple[np.ndarray, np.ndarray, np.ndarray]) -> f
 
 
 def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
-    """Sample evenly spread rows of the frames: (n, rows, blocks, BLOCK) float32; pixels that fill
-    whole blocks."""
+    """Sample evenly spread rows of the frames: (n, rows, blocks, BLOCK) of their dtype; pixels that
+    fill whole blocks."""
     height, width = stack.shape[1:]
     rows = np.unique(np.linspace(0, height - 1, min(ROWS, height)).round().astype(int))
     block = BLOCK if width >= BLOCK else 1
     step = max(1, width // (block * 64))
-    blocks = len(rows), width // block, block
-    out = np.empty((len(indices), len(rows), -(-blocks[1] // step), block), np.float32)
-    for sampled, i in zip(out, indices, strict=True):
-        sampled[:] = stack[i][rows][:, : blocks[1] * block].reshape(blocks)[:, ::step]
+    used, whole = width // block * block, np.dtype((np.void, block * stack.itemsize))
+    out = np.empty((len(indices), len(rows), -(-used // (block * step)), block), stack.dtype)
+    for sampled, i in zip(out.view(whole)[..., 0], indices, strict=True):
+        lines = np.ascontiguousarray(stack[i][rows][:, :used])
+        sampled[:] = lines.view(whole)[:, ::step]  # a block is one item
     return out
 
 
@@ -80,7 +81,7 @@ def _measure_phase_step_noise(
     """Return levels, variances and degrees of freedom of blocks, from the residual of cosines in
     the phase steps."""
     n = len(samples)
-    samples = samples[:, _select_unclipped_blocks(samples, white)]  # (n, blocks, BLOCK)
+    samples = _select_unclipped(samples, white)  # (n, blocks, BLOCK)
     own = max(1, min(OWN_HARMONICS, (n - 1) // 2 - 2))
     frames = samples.reshape(n, -1)
     background, phasor = fit_cosine(frames)
@@ -110,8 +111,8 @@ def _measure_inverse_noise(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return levels, variances and degrees of freedom of blocks, from sums of bits and their
     inverses."""
-    usable = _select_unclipped_blocks(np.concatenate([gray, inverse]), white)
-    total = (gray + inverse)[:, usable]
+    both = _select_unclipped(np.concatenate([gray, inverse]), white)
+    total = both[: len(gray)] + both[len(gray) :]
     # Interreflected light and room light hardly differ between neighbours.
     rest = total - total.mean(axis=0)
     rest -= rest.mean(axis=-1, keepdims=True)
@@ -129,11 +130,12 @@ def _measure_difference_noise(
     """
     if samples.shape[-1] < BLOCK:
         return np.zeros(0), np.zeros(0), 1.0
-    usable = _select_unclipped_blocks(samples, white)
-    if usable.any():
-        samples = samples[:, usable].reshape(-1, samples.shape[-1])  # each frame has its own level
+    usable = _select_unclipped(samples, white)
+    if usable.size:
+        samples = usable.reshape(-1, samples.shape[-1])  # each frame has its own level
     else:
-        samples = samples[(samples.max(axis=-1) < white) & (samples.min(axis=-1) > 0)]
+        is_unclipped = (samples.max(axis=-1) < white) & (samples.min(axis=-1) > 0)
+        samples = samples[is_unclipped].astype(np.float32)
     third = np.diff(samples, n=3, axis=-1)
     # 1 + 9 + 9 + 1; five that overlap
     return (
@@ -143,10 +145,13 @@ def _measure_difference_noise(
     )
 
 
-def _select_unclipped_blocks(samples: np.ndarray, white: float) -> np.ndarray:
-    """Return a mask (rows, blocks) of the blocks clipped neither at white nor at black, which would
-    hide noise."""
-    return (samples.max(axis=0).max(axis=-1) < white) & (samples.min(axis=0).min(axis=-1) > 0)
+def _select_unclipped(samples: np.ndarray, white: float) -> np.ndarray:
+    """Return the sampled blocks (n, blocks, BLOCK) float32 that are clipped neither at white nor at
+    black in any of the n frames, which would hide noise."""
+    highest, lowest = samples.max(axis=0).max(axis=-1), samples.min(axis=0).min(axis=-1)
+    usable = ((highest < white) & (lowest > 0)).ravel()
+    blocks = samples.reshape(len(samples), usable.size, samples.shape[-1])
+    return np.compress(usable, blocks, axis=1).astype(np.float32)
 
 
 def _bin_variances(

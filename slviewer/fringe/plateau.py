@@ -39,7 +39,8 @@ def find_plateau(levels: np.ndarray, full_scale: float) -> float | None:
         return None
     for width in WIDTHS[: 1 if is_image else None]:
         step = width * full_scale / 255
-        own = levels if is_image else levels[:, span >= max(0.1 * top, LEAST_RANGE * step)]
+        is_wide = span >= max(0.1 * top, LEAST_RANGE * step)
+        own = levels if is_image else np.compress(is_wide, levels, axis=1)
         occurring = np.flatnonzero(counts := np.bincount(own.ravel(), minlength=1))
         # levels of fewer bits than the images have are further apart
         size = max(float(np.diff(occurring).min(initial=top)), full_scale / 255)
@@ -54,10 +55,10 @@ def find_plateau(levels: np.ndarray, full_scale: float) -> float | None:
 def _find_end(counts: np.ndarray, width: int) -> int:
     """Return the bin behind a plateau of ``width`` bins, by the samples in each from the brightest
     level down; 0 where there is none."""
-    total = np.concatenate([[0], np.cumsum(counts[: 12 * max(WIDTHS)])])
+    total = [0, *np.cumsum(counts[: 12 * max(WIDTHS)]).tolist()]
     for first in range(2 * max(WIDTHS)):
-        at = np.minimum(first + width * np.array([0, 1, 2, 10]), len(total) - 1)
-        above, end, following, ninth = total[at]
+        at = [min(first + width * k, len(total) - 1) for k in (0, 1, 2, 10)]
+        above, end, following, ninth = (total[k] for k in at)
         own = end - above
         least = max(FEWEST_SAMPLES, OVER_NEXT * (following - end), OVER_NINE * (ninth - end))
         if own >= least and above <= ABOVE * own:

@@ -70,22 +70,20 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
     ``phase.noise``."""
     if not phase.steps or min(phase.phase.shape) < WINDOW:
         return Scatter(np.nan, 1.0)
-    where, first = _select_valid_windows(phase)
+    first = _select_valid_windows(phase)
     if len(first) < FEWEST:
         return Scatter(np.nan, 1.0)
-    values = phase.phase[where]
+    values, background, modulation = (
+        _cut_windows(each, first) for each in (phase.phase, phase.background, phase.modulation)
+    )
     values = values - values.mean(axis=(1, 2), keepdims=True)  # exact enough in float32
     third = [np.diff(values, n=3, axis=axis) for axis in (1, 2)]
     blockiness = max(
         _measure_blockiness(np.abs(np.moveaxis(third[i], i + 1, 2)), first[:, i]) for i in range(2)
     )
     a, b = phase.noise
-    predicted = np.maximum(
-        np.float32(a) + np.float32(b) * phase.background[where], np.float32(ROUNDING)
-    )
-    predicted *= (
-        np.float32(2 / phase.steps) / np.maximum(phase.modulation[where], np.float32(1e-6)) ** 2
-    )
+    predicted = np.maximum(np.float32(a) + np.float32(b) * background, np.float32(ROUNDING))
+    predicted *= np.float32(2 / phase.steps) / np.maximum(modulation, np.float32(1e-6)) ** 2
     predicted += np.float32(phase.model_error_rad**2)
     if blockiness > BLOCKINESS:
         ratio = float(np.median(_compute_window_variance(values) / predicted.mean(axis=(1, 2))))
@@ -97,21 +95,22 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
     return Scatter(float(np.sqrt(ratios[int(QUANTILE * len(ratios))] / expected)), blockiness)
 
 
-def _select_valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return pixel indices of evenly spread windows in which every pixel is valid.
-
-    Rows and columns (m, WINDOW, WINDOW), and those of the first pixel (m, 2).
-    """
+def _select_valid_windows(phase: PhaseMap) -> np.ndarray:
+    """Return row and column of the first pixel (m, 2) of evenly spread windows in which every pixel
+    is valid."""
     height, width = phase.phase.shape
     corners = [
         np.unique(np.linspace(0, size - WINDOW, min(WINDOWS, size // WINDOW)).astype(int))
         for size in (height, width)
     ]
     first = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 2)
-    reach = np.arange(WINDOW)
-    rows, columns = first[:, :1, None] + reach[:, None], first[:, 1:, None] + reach
-    valid = (phase.reason[rows, columns] == Reason.VALID).all(axis=(1, 2))
-    return (rows[valid], columns[valid]), first[valid]
+    return first[(_cut_windows(phase.reason, first) == Reason.VALID).all(axis=(1, 2))]
+
+
+def _cut_windows(image: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the windows (m, WINDOW, WINDOW) of an image (h, w) whose ``first`` pixels (m, 2) are
+    given."""
+    return np.lib.stride_tricks.sliding_window_view(image, (WINDOW, WINDOW))[*first.T]
 
 
 def _measure_blockiness(third: np.ndarray, first: np.ndarray) -> float:

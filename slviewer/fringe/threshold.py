@@ -22,8 +22,8 @@ def fringe_mean(layout: Layout, stack: np.ndarray) -> float:
     """
     if layout.inverse or not (layout.shifts and layout.gray):
         return MIDDLE
-    fringes = sample(stack, layout.shifts[-1].indices)
-    heights = sample(stack, layout.gray) - fringes.mean(axis=0)
+    fringes = sample(stack, layout.shifts[-1].indices).astype(np.float32)
+    heights = sample(stack, layout.gray).astype(np.float32) - fringes.mean(axis=0)
     swing = 0.25 * (fringes.max(axis=0) - fringes.min(axis=0))
     above, below = heights.max(axis=0), -heights.min(axis=0)
     both = (above > swing) & (below > swing) & (swing > 1)

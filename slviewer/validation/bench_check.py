@@ -39,10 +39,10 @@ from slviewer.validation.proof import track
 
 LIMITS = {
     "decode, kernel / floor": 3.5,
-    "decode, whole / kernel": 4.2,
+    "decode, whole / kernel": 3.3,
     "examine a capture / kernel": 4.6,
-    "noise and fringe mean, sampled / kernel": 0.4,
-    "second pass, over spikes / kernel": 0.32,
+    "noise and fringe mean, sampled / kernel": 0.32,
+    "second pass, over spikes / kernel": 0.29,
     "one pass, pixelwise / floor": 3.3,
     "write points as PLY / floor": 4.5,
     "reconstruct again in the process / kernel": 86.0,

@@ -96,7 +96,7 @@ def test_windows_are_those_of_filters_of_the_whole_image():
     measured = np.empty((*size, 8))
     arrays = white, phase, amplitude, background, reason
     limits = np.array([240.0, 2.0, 0.1])
-    indirect_light._measure_samples(arrays, limits, np.arange(40), np.arange(60), measured)
+    indirect_light._measure_samples(0, 40, arrays, limits, np.arange(40), np.arange(60), measured)
     valid = (reason == 0) & (white < 240) & (white > background)
     light = uniform_filter(np.where(valid, white - background.astype(float), 0), 7)
     strength = np.log(uniform_filter(np.where(valid, amplitude.astype(float), 0), 7) / light)
@@ -115,13 +115,18 @@ def test_no_weak_fringes_are_lost_by_the_selection_of_candidates():
     task = prepare_decoding(sequence, frames, "x")
     plain = decode(sequence, frames, "x", mask_indirect=False)
     maps = plain.phase, plain.wrapped, plain.modulation, plain.background, plain.reason
-    weak = indirect_light._detect_weak_fringes(task, frames[-1], maps)
+    masked = tuple(each.copy() for each in maps)
+    indirect_light._mask_weak_fringes(task, frames[-1], masked)
+    weak = np.flatnonzero(masked[-1] == Reason.INDIRECT)
+    assert np.isnan(masked[0].ravel()[weak]).all()
     assert sequence.frames[-1].kind == "texture"
     arrays, limits = (frames[-1], maps[0], *maps[2:]), np.array([task.white, *task.noise])
     sampled = indirect_light._sample_strength(arrays, limits)
     fit, spread = indirect_light._fit_strength(sampled[:, 0], sampled[:, 2:])
     everywhere = np.empty((*frames.shape[1:], 8))
-    indirect_light._measure_samples(arrays, limits, *map(np.arange, frames.shape[1:]), everywhere)
+    height, width = frames.shape[1:]
+    pixels = np.arange(height), np.arange(width)
+    indirect_light._measure_samples(0, height, arrays, limits, *pixels, everywhere)
     margin = spread - np.log(1 - indirect_light.WEAK) + everywhere[..., 1]
     expected = np.flatnonzero(everywhere[..., 0] < everywhere[..., 2:] @ fit - margin)
     assert len(expected) > 1000
