@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 
+import cv2
 import numpy as np
 
 from slviewer.errors import InputError
@@ -46,6 +47,17 @@ class Atoms:
             for shift, values in zip(shifts, self.values, strict=True)
         ]
         return replace(self, values=np.array(moved, np.float32))
+
+    def blurred(self, sigma_px: float) -> "Atoms":
+        """Return the same with the edges of stripes blurred by a Gaussian of ``sigma_px``."""
+        stripes = self.groups < 0
+        if not sigma_px or not stripes.any():
+            return self
+        values, sigma = self.values.copy(), sigma_px / self.step_px
+        values[stripes] = cv2.GaussianBlur(
+            values[stripes], (0, 0), sigma, sigmaY=1e-3, borderType=cv2.BORDER_REPLICATE
+        )
+        return replace(self, values=values)
 
     def slope_at(self, coordinate: np.ndarray) -> np.ndarray:
         """Return the change (k, p) of the values per px at coordinates (p,) px."""

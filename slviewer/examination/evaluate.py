@@ -136,7 +136,10 @@ class Evaluator:
                 gains.append(loss[0] - loss[1])
                 losses.append(loss[0])
         gain = np.concatenate(gains)
-        mean, error = float(gain.mean()), float(gain.std()) / np.sqrt(len(gain))
+        mean = float(gain.mean())
+        # chance loses as often as it gains: few pixels that gain much are no sign of it
+        chance = np.sqrt(2 * np.mean(np.minimum(gain, 0) ** 2))
+        error = max(float(chance), float(gain.std()) / limits.MOST_SKEWED) / np.sqrt(len(gain))
         every = np.concatenate(losses)
         return MisfitChange(float(every.mean()) if every.size else 1.0, mean, mean / (error + 1e-9))
 

@@ -62,11 +62,9 @@ def _judge(
         return [describe_missing_pattern(sample)]
     ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
     found = explain(evaluator, base)
-    # the first image has none before it, and stands out from those that have a ghost
-    is_first = len(found) == 1 and found[0].cause == "duplicate-frame"
     if motion and _are_displaced(evaluator, found):
         found = ()
-    if found and not (ghost and is_first):
+    if found and not (ghost and _is_like_ghost(found)):
         return _describe_explanation(found, evaluator, base)
     coordinates = [*_judge_coordinates(evaluator, base)]
     # codes that cannot be are displaced as well
@@ -97,11 +95,20 @@ def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evalu
     return evaluator if rivals and max(rivals) < equal.compare(base, base).loss else equal
 
 
+def _is_like_ghost(found: Explanation) -> bool:
+    """Return whether ghosts imitate an explanation: motion, beside which they are measured, and one
+    strange frame, as the first image, which has none before it, stands out."""
+    first, *others = found
+    return first.cause == "moved" or (first.cause == "duplicate-frame" and not others)
+
+
 def _are_displaced(evaluator: Evaluator, found: Explanation) -> bool:
-    """Return whether frames that show no other pattern show their own one displaced."""
+    """Return whether frames that show no other pattern, or a later one, show their own one
+    displaced."""
     return any(
-        hypothesis.cause == "duplicate-frame"
-        and hypothesis.value is None
+        len(hypothesis.frames) == 1
+        and not hypothesis.images
+        and (hypothesis.value is None or hypothesis.value > hypothesis.frames[0])
         and is_displaced(evaluator, described(hypothesis.sequence), *hypothesis.frames)
         for hypothesis in found
     )

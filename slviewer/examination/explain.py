@@ -16,6 +16,7 @@ from slviewer.examination.hypotheses import (
     list_orders,
     recover_orders,
 )
+from slviewer.examination.motion import has_trend
 from slviewer.fringe.sequence import Indices, PatternSequence
 from slviewer.records.verdict import Cause
 
@@ -47,14 +48,14 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
     sequence, out = base.sequence, list[int]()
     for axis, sample, m, good in evaluator.explained(base):
         bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
-        residual = (m.residual(sample) / m.contrast.clip(1e-3))[:, good].clip(-1, 1)
+        patterns = evaluator.atoms(base, axis).at(m.coordinate[good])[m.places]
+        seen = (sample.levels[m.images, 1] - m.background)[:, good] / m.contrast[good].clip(1e-3)
         pairs = [*zip(bits, inverse, strict=True)] if inverse else [(i,) for i in bits]
         for pair in reversed(pairs):
             places = [m.images.index(i) for i in pair]
-            own = m.predicted[places][:, good]
-            own = own - own.mean(axis=1, keepdims=True)
+            own = patterns[places] - patterns[places].mean(axis=1, keepdims=True)
             squares = np.maximum(np.einsum("kp,kp->k", own, own), 1e-6)
-            contrasts = 1 + np.einsum("kp,kp->k", own, residual[places]) / squares
+            contrasts = np.einsum("kp,kp->k", own, seen[places].clip(-1, 2)) / squares
             if not (np.abs(contrasts) < limits.UNRESOLVED).all():
                 break
             out += pair
@@ -78,7 +79,7 @@ def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
             own = residuals[np.array(m.images)[groups == group]]
             if own.max() > limits.STANDS_OUT * np.median(own) + limits.STANDS_OUT_LEAST:
                 return True
-    return False
+    return has_trend(evaluator, base)  # it leaves little that the coordinates do not take up
 
 
 def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
@@ -242,11 +243,12 @@ def _choose_strange(evaluator: Evaluator, rated: Sequence[_Rated]) -> Explanatio
     """Return, of frames that show something else, the one that explains all images best, and of
     about equally likely ones one that repeats an earlier frame, else the one that fits least
     itself; empty where blur or the projector's response explains why it does not fit."""
-    rivals = list[tuple[bool, float, np.ndarray, Hypothesis]]()
+    rivals, best = list[tuple[bool, float, np.ndarray, Hypothesis]](), rated[0]
     for each in rated:
         first = each.hypotheses[0]
         k = first.excluded
-        if k is not None and each.net > limits.RIVAL * rated[0].net:
+        is_rival = each.net > limits.RIVAL * best.net or each.comparison.left < best.comparison.left
+        if k is not None and is_rival:
             residual = _measure_strangeness(evaluator, first, k)
             share = each.net / each.comparison.loss
             if residual > (0 if share > limits.STRANGE_SHARE else limits.VERY_STRANGE):

@@ -357,7 +357,7 @@ def describe_motion(sequence: PatternSequence, axis: Axis, displacement: float) 
     period = sequence.period_px(axis)
     is_much = abs(displacement) > limits.MUCH_MOTION * period
     text = (
-        f"something moved: from the first to the last phase step the pattern of axis {axis} shifted"
+        f"something moved: from the first to the last image the pattern of axis {axis} shifted"
         f" by {abs(displacement):.1f} px of the projector"
     )
     severity: Severity = "rejected" if is_much else "doubtful"
@@ -376,7 +376,7 @@ def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Fin
     gain = light.gain[used]
     span = float(gain.max() / gain.min()) - 1
     wave = float(np.sqrt(np.mean(light.wave**2)))
-    # without phase steps motion is not measured
+    # of stripes motion is measured only where a bit and its inverse differ
     moving = "" if list_shifts(sequence) else ", or a scene that comes nearer or moves away"
     if "wave" in light.terms and wave > limits.REPORTED / 3:
         text = (

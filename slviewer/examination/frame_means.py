@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from slviewer.examination import limits
-from slviewer.fringe.frame_light import FrameLight
+from slviewer.fringe.frame_light import FrameLight, list_shifts
 from slviewer.fringe.sequence import PatternSequence
 
 
@@ -21,29 +21,46 @@ def evaluate_waves(row: np.ndarray, light: FrameLight) -> tuple[np.ndarray, np.n
 
 def measure_unequal_means(
     sequence: PatternSequence, stack: np.ndarray, light: FrameLight
-) -> tuple[float, float, float]:
-    """Measure the largest relative standard deviation of means of frames equal under equal light:
-    as captured, and without the light's gains and room light; and that of the gains, which room
-    light would have to balance where the means do not vary.
+) -> np.ndarray:
+    """Measure the relative standard deviation (3, g) of each of g groups of means that are equal
+    under equal light: as captured, and without the light's gains and room light; and that of the
+    gains, which room light would have to balance where the means do not vary.
 
-    Equal are the steps of the finest period of an axis, and the sums of a bit and its inverse. A
-    surface that moves, and blur, imitate varying light, but not in these means.
+    A surface that moves, and blur, imitate varying light, but not in these means.
     """
-    means = stack[:, :: limits.MEAN_ROWS, :: limits.MEAN_COLUMNS].mean(axis=(1, 2))
+    means = _measure_means(stack)
     # without the light of the room the mean is smaller, and the differences are the same
     equalized = (means - light.room * means.mean()) / light.gain
-    spreads = []
-    for values, whole in ((means, means), (equalized, means), (light.gain, light.gain)):
-        spreads.append(
-            max(
-                (
-                    float(np.std(values[group].sum(axis=1)) / whole[group].sum(axis=1).mean())
-                    for group in _list_equal_sums(sequence)
-                ),
-                default=0.0,
-            )
-        )
-    return spreads[0], spreads[1], spreads[2]
+    pairs = ((means, means), (equalized, means), (light.gain, light.gain))
+    groups = [*_list_equal_sums(sequence)]
+    spreads = [
+        [np.std(values[g].sum(axis=1)) / whole[g].sum(axis=1).mean() for g in groups]
+        for values, whole in pairs
+    ]
+    return np.array(spreads).reshape(3, -1)
+
+
+def measure_drift(sequence: PatternSequence, stack: np.ndarray) -> float:
+    """Return by how much the logarithm of the light grows from frame to frame; 0 where the means
+    do not show it, or it is too little to be reported.
+
+    What imitates gains depends on the pattern, and a drift of the light on time alone: the sums of
+    a bit and its inverse, and of all steps of a period, are equal whatever they show.
+    """
+    *_, sums = [np.empty((0, 0), int), *_list_equal_sums(sequence)]
+    if sums.shape[1] < 2:
+        return 0.0
+    time = sums.mean(axis=1)
+    logs = np.log(np.maximum(_measure_means(stack)[sums].mean(axis=1), 1e-6))
+    rate, start = np.polyfit(time, logs, 1)
+    left, whole = np.std(logs - rate * time - start), np.std(logs)
+    is_steady = left < limits.LEFT_BY_DRIFT * whole
+    return float(rate) if is_steady and abs(rate) * len(stack) > limits.REPORTED else 0.0
+
+
+def _measure_means(stack: np.ndarray) -> np.ndarray:
+    """Return the mean grey level (n,) of each image."""
+    return stack[:, :: limits.MEAN_ROWS, :: limits.MEAN_COLUMNS].mean(axis=(1, 2))
 
 
 def shows_wave(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> bool:
@@ -54,8 +71,8 @@ def shows_wave(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) 
     products = {kind: np.zeros(3) for kind in limits.SEEN_OF_ROWS}
     for group in _list_equal_sums(sequence):
         first = sequence.frames[group[0, 0]]
-        if first.kind == "phase" and first.axis == "y":
-            continue  # the fringes are along the rows
+        if group.shape[1] > 2 or (first.kind == "phase" and first.axis == "y"):
+            continue  # a whole period averages a wave, and fringes are along the rows
         sums = rows[group].sum(axis=1)
         excess = sums / np.maximum(sums.mean(axis=0), 1e-6) - 1
         seen = (excess - excess.mean(axis=1, keepdims=True)) @ waves.T * (2 / rows.shape[1])
@@ -69,10 +86,16 @@ def shows_wave(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) 
 
 
 def _list_equal_sums(sequence: PatternSequence) -> Iterator[np.ndarray]:
-    """Yield groups (g, 1 or 2) of frames whose means, or sums of means, are equal."""
+    """Yield groups (g, m) of frames whose sums of m means are equal: steps of the finest period of
+    an axis where many fringes are in view, bits with their inverses, and all steps of periods; the
+    last group has the most equal ones."""
     for axis in sequence.axes:
         for _, steps in sequence.phase_shifts(axis)[-1:]:
             yield np.array(steps)[:, None]
-        bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
-        if bits and len(bits) == len(inverse):
-            yield np.array([bits, inverse]).T
+    bits = [i for axis in sequence.axes for i in sequence.bits("gray", axis)]
+    inverse = [i for axis in sequence.axes for i in sequence.bits("inverse", axis)]
+    if bits and len(bits) == len(inverse):
+        yield np.array([bits, inverse]).T
+    shifts = list_shifts(sequence)
+    if len(shifts) > 1 and len({*map(len, shifts)}) == 1:
+        yield np.array(shifts)

@@ -29,7 +29,9 @@ def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
     n = len(sequence.frames)
     for lag in (1, 2, 3, -1):
         images = [i + lag if 0 <= i + lag < n else None for i in range(n)]
-        yield _order("frame-lag", sequence, images, value=lag)
+        # that all frames are moved is no more to assume than that some are
+        cost = PER_FRAME_COST + LOST_COST * abs(lag)
+        yield replace(_order("frame-lag", sequence, images, value=lag), cost=cost)
     kinds = [frame.kind for frame in sequence.frames]
     yield from (
         exchange(sequence, k, k + 1) for k in range(n - 1) if "texture" not in kinds[k : k + 2]

@@ -9,29 +9,31 @@ selected, and nothing is corrected that the frames' means, or the match of the p
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, Hypothesis, described
-from slviewer.examination.frame_means import evaluate_waves, measure_unequal_means, shows_wave
+from slviewer.examination.frame_means import (
+    evaluate_waves,
+    measure_drift,
+    measure_unequal_means,
+    shows_wave,
+)
 from slviewer.examination.sample import CaptureSample, Sample, sample_capture
 from slviewer.fringe.frame_light import FrameLight, Term, estimate_albedo, list_shifts
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.sequence import Axis, PatternSequence
 
-Variation = Term | Literal["drift"]
-"""A term of the light, or gains that grow or fade steadily."""
-MODELS: tuple[tuple[Variation, ...], ...] = (
-    ("drift",), ("room",), ("gain",), ("wave",), ("gain", "wave"), ("gain", "room")
+MODELS: tuple[tuple[Term, ...], ...] = (
+    ("room",), ("gain",), ("wave",), ("gain", "wave"), ("gain", "room")
 )  # fmt: skip
-VALUES: dict[Variation, tuple[str, ...]] = {
+VALUES: dict[Term, tuple[str, ...]] = {
     "gain": ("gain",), "wave": ("cosine", "sine"),
-    "room": ("uniform", "albedo", "rows", "columns"), "drift": ("gain",),
+    "room": ("uniform", "albedo", "rows", "columns"),
 }  # fmt: skip
-"""Unknowns of each term: one a frame; of a drift its rate, and of room light one for all frames
+"""Unknowns of each term: one a frame; of room light one for all frames
 from its change on."""
 PRIORS = {
     "gain": 0.3, "cosine": 0.1, "sine": 0.1, "uniform": 30.0, "albedo": 1.0, "rows": 1.0,
@@ -81,20 +83,23 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
     an evaluator holds. One step of each term decides first whether there is any to estimate."""
     constant = FrameLight.constant(len(stack))
     fitted = evaluator.part(np.s_[::2])
-    if not (varying := _list_varying(fitted, base)):
+    varying, rate = _list_varying(fitted, base), measure_drift(base.sequence, stack)
+    if not varying and not rate:
         return constant
     judged = evaluator.part(np.s_[1::2])
-    best, gains, score = constant, constant, 1.0
     first = _measure_losses(judged, judged, base, constant)
+    drift, score = _judge_drift(judged, base, rate, first)
+    best, gains = drift, constant
     for terms in MODELS:
         if len(terms) > 1 and score < limits.EXPLAINED_WELL:
             break
         if not varying.issuperset(terms):
             continue
         light = _fit(fitted, base, terms, gains if "gain" in terms else constant)
-        if terms == ("gain",):  # misread bits lead astray from equal light, few fringes from means
-            other = _fit(fitted, base, terms, _start_from_means(fitted, base))
-            gains = light = min(light, other, key=lambda x: _score(judged, base, x, first))
+        if terms == ("gain",):
+            gains = light = _choose_gains(
+                light, *_fit_from_means(fitted, base), judged, base, first
+            )
         if len(terms) > 1 and not _is_large(base.sequence, stack, light, "gain"):
             light = replace(light, gain=constant.gain, terms=light.terms[1:])
         own = _score(judged, base, light, first)
@@ -102,42 +107,54 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
         if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
     light = _accept(base.sequence, stack, best, score) if best.terms else constant
-    drift = constant if light.terms else _extract_drift(base.sequence, gains)
-    is_better = drift.terms and np.isfinite(_score(judged, base, drift, first))
-    return drift if is_better else light
+    return drift if drift.terms and not light.terms else light
 
 
-def _extract_drift(sequence: PatternSequence, light: FrameLight) -> FrameLight:
-    """Return a light that grows or fades steadily, at the rate of the gains of another one; equal
-    light where the steps of each period do not agree about it, or it is too little to be reported.
-
-    What imitates gains depends on the pattern, and a drift of the light on time alone: the rate is
-    known better than the gains of three steps, or than those of dark frames.
-    """
-    shifts, count = list_shifts(sequence), len(light.gain)
+def _judge_drift(
+    evaluator: Evaluator, base: Hypothesis, rate: float, first: np.ndarray
+) -> tuple[FrameLight, float]:
+    """Return a light that grows by a rate from frame to frame, and its score; equal light where it
+    does not explain the pixels, whose losses under equal light are ``first`` (p,)."""
+    count = len(base.images)
     constant = FrameLight.constant(count)
-    if len(shifts) < limits.FEWEST_RATES:
-        return constant
-    times = [np.array(steps) - np.mean(steps) for steps in shifts]
-    weights = [time @ time for time in times]
-    moments = [t @ np.log(light.gain[[*s]]) for t, s in zip(times, shifts, strict=True)]
-    rates = np.array(moments) / weights
-    rate = np.average(rates, weights=weights)
-    error = np.sqrt(np.average((rates - rate) ** 2, weights=weights) / (len(rates) - 1))
-    if abs(rate) < max(limits.SIGMAS * error, limits.REPORTED / count):
-        return constant
     gain = np.exp(rate * (np.arange(count) - count / 2))
-    return replace(constant, gain=gain, terms=("gain",))
+    drift = replace(constant, gain=gain, terms=("gain",))
+    score = _score(evaluator, base, drift, first) if rate else np.inf
+    return (drift, score) if np.isfinite(score) else (constant, 1.0)
 
 
-def _start_from_means(evaluator: Evaluator, base: Hypothesis) -> FrameLight:
-    """Return the light whose gains are the frames' mean levels, over those of their axis."""
+def _choose_gains(
+    of_equal: FrameLight,
+    of_means: FrameLight,
+    centred: FrameLight,
+    evaluator: Evaluator,
+    base: Hypothesis,
+    first: np.ndarray,
+) -> FrameLight:
+    """Return the best of gains that were fitted from equal light, where misread bits lead astray,
+    and from means, where few fringes do; between kinds of frames they differ only where that
+    explains more."""
+    own, other, least = (_score(evaluator, base, x, first) for x in (of_equal, of_means, centred))
+    if other < limits.BETTER_LIGHT[1] * min(own, least):
+        return of_means
+    return centred if least < own else of_equal
+
+
+def _fit_from_means(evaluator: Evaluator, base: Hypothesis) -> tuple[FrameLight, FrameLight]:
+    """Fit gains, beginning with the frames' mean levels over those of their axis; second relative
+    to the mean of the frames of a kind, as the fit changes only these."""
+    constant = FrameLight.constant(len(base.images))
     gain = np.ones(len(base.images))
-    for axis, sample in evaluator.sample.by_axis.items():
-        frames = evaluator.atoms(base, axis).frames
-        means = sample.levels[frames, 1].mean(axis=1) + 1
-        gain[frames] = means / np.exp(np.log(means).mean())
-    return replace(FrameLight.constant(len(gain)), gain=gain)
+    every = [evaluator.atoms(base, axis) for axis in evaluator.sample.by_axis]
+    for atoms, sample in zip(every, evaluator.sample.by_axis.values(), strict=True):
+        means = sample.levels[atoms.frames, 1].mean(axis=1) + 1
+        gain[atoms.frames] = means / np.exp(np.log(means).mean())
+    light = _fit(evaluator, base, ("gain",), replace(constant, gain=gain))
+    logs = np.log(light.gain)
+    for atoms in every:
+        same = (atoms.groups[:, None] == atoms.groups).astype(float)
+        logs[atoms.frames] -= same @ logs[atoms.frames] / same.sum(axis=1)
+    return light, replace(light, gain=np.exp(logs))
 
 
 def _accept(
@@ -149,13 +166,14 @@ def _accept(
     before, after, claimed = measure_unequal_means(sequence, stack, light)
     is_refuted = after > limits.REFUTED * before + limits.REFUTED_LEAST
     is_refuted |= claimed > 3 * before + limits.CONFIRMED_LEAST
-    is_strange = np.abs(np.log(light.gain)).max() > limits.FARTHEST_GAIN
     # means that differ anyway, of few fringes in view, refute nothing that explains much
-    is_final = before < limits.CONFIRMED_LEAST or score > limits.EXPLAINED_CLEARLY
-    if is_strange or (is_refuted and is_final):
+    if score <= limits.EXPLAINED_CLEARLY:
+        is_refuted &= before < limits.CONFIRMED_LEAST
+    is_strange = np.abs(np.log(light.gain)).max() > limits.FARTHEST_GAIN
+    if is_strange or is_refuted.any():
         return constant
-    is_confirmed = before > limits.CONFIRMED_LEAST and after < limits.CONFIRMED * before
-    if is_confirmed or score < limits.EXPLAINED_BY_LIGHT:
+    is_confirmed = (before > limits.CONFIRMED_LEAST) & (after < limits.CONFIRMED * before)
+    if is_confirmed.any() or score < limits.EXPLAINED_BY_LIGHT:
         return light
     return replace(constant, unexplained=light.terms)
 
@@ -307,9 +325,7 @@ class _Normal:
         """Indices of the frames that the sample shows."""
         return np.flatnonzero(self.level)
 
-    def solve(
-        self, terms: Sequence[Variation], change: int = 0
-    ) -> tuple[dict[str, np.ndarray], float]:
+    def solve(self, terms: Sequence[Term], change: int = 0) -> tuple[dict[str, np.ndarray], float]:
         """Return the change (n,) of each value, and the share of the residual that it removes.
 
         Beside the values of the terms, contrast and level of each period's steps, and the contrast
@@ -331,7 +347,7 @@ class _Normal:
             step[0] = np.where(sure, step[0] - same @ step[0], 0)
         return dict(zip(self.values, step, strict=True)), float(x @ moment) / max(self.entries, 1)
 
-    def rate_changes(self, terms: Sequence[Variation]) -> dict[int, float]:
+    def rate_changes(self, terms: Sequence[Term]) -> dict[int, float]:
         """Return the share of the residual that a change of the room's light removes, by the frame
         before which it happens: a few from either end, and inside a group of frames; between groups
         level and contrast of the fringes imitate it."""
@@ -351,7 +367,7 @@ class _Normal:
         return out
 
     def _reduce(
-        self, terms: Sequence[Variation], changes: Sequence[int]
+        self, terms: Sequence[Term], changes: Sequence[int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return what q unknowns do to the values (v n, q), their normal equations (q, q) and (q,)
         with what is known of them before, and the frame before which the room's light changes (q,),
@@ -367,8 +383,6 @@ class _Normal:
         if "gain" in terms:
             same = (self.groups[:, None] == self.groups).astype(float)
             blocks["gain"] = each - same / same.sum(axis=1, keepdims=True)
-        if "drift" in terms:
-            blocks["gain"] = (np.arange(n) / n - 0.5)[:, None]
         if "room" in terms:
             blocks |= dict.fromkeys(VALUES["room"], np.tri(n)[:, [*changes]])
         used = [(place, name) for place, name in enumerate(self.values) if name in blocks]
@@ -387,9 +401,7 @@ class _Normal:
         return t, normal, t.T @ self.moment, np.array(of_room)
 
 
-def _accumulate(
-    parts: Sequence[_Residual], light: FrameLight, terms: Sequence[Variation]
-) -> _Normal:
+def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[Term]) -> _Normal:
     """Return the normal equations of the terms, and of contrast and level, about a light."""
     n = len(light.gain)
     values = (*(name for term in terms for name in VALUES[term]), "contrast", "level")
@@ -421,7 +433,7 @@ def _accumulate(
     return _Normal(values, matrix, moment, loss, entries, groups, level, fuzzy)
 
 
-def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Variation]:
+def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Term]:
     """Return the terms of which one step promises to explain more of the residual than as many
     values of noise do, beside contrast and level."""
     light = FrameLight.constant(len(base.sequence.frames))
@@ -431,8 +443,7 @@ def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Variation]:
     light = replace(light, cycles=_find_wave(parts))
     normal = _accumulate(parts, light, ("gain", "wave", "room"))
     before, count = normal.solve(())[1], len(normal.known)
-    shares: dict[Variation, float] = {
-        "drift": normal.solve(("drift",))[1] - 1 / normal.entries,
+    shares: dict[Term, float] = {
         "gain": normal.solve(("gain",))[1] - count / normal.entries,
         "wave": normal.solve(("wave",))[1] - 2 * count / normal.entries,
         "room": max(normal.rate_changes(("room",)).values(), default=0.0),
@@ -453,12 +464,11 @@ def _find_wave(parts: Sequence[_Residual]) -> float:
 
 
 def _fit(
-    evaluator: Evaluator, base: Hypothesis, terms: tuple[Variation, ...], start: FrameLight
+    evaluator: Evaluator, base: Hypothesis, terms: tuple[Term, ...], start: FrameLight
 ) -> FrameLight:
     """Fit the terms of a model by Gauss-Newton steps from a first light, and return the light of
     the last step that leaves about the least residual: of few fringes in view they may diverge."""
-    fitted: tuple[Term, ...] = tuple("gain" if term == "drift" else term for term in terms)
-    light = best = replace(start, terms=fitted)
+    light = best = replace(start, terms=terms)
     least = np.inf
     for step in range(limits.MOST_STEPS):
         equal = equalize_samples(evaluator, base.sequence, light)
@@ -524,7 +534,7 @@ def _is_large(
     sequence: PatternSequence,
     stack: np.ndarray,
     light: FrameLight,
-    term: Variation,
+    term: Term,
     left: float = 1.0,
 ) -> bool:
     """Return whether a term of the light, which leaves that share of the residual, is large enough
@@ -536,9 +546,6 @@ def _is_large(
     if term == "room":
         return float(np.ptp(light.room)) > limits.LEAST_ROOM
     logs = np.log(light.gain)
-    if term == "drift":
-        before, after, _ = measure_unequal_means(sequence, stack, light)
-        return float(np.ptp(logs)) > limits.REPORTED and after < limits.LEFT_BY_DRIFT * before
     for steps in list_shifts(sequence):
         least = limits.LEAST_GAIN if len(steps) > 3 else limits.LEAST_GAIN_OF_THREE
         if logs[[*steps]].std() > least:

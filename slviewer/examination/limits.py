@@ -45,6 +45,11 @@ UNDECIDED = 0.6
 """Share of one bit's variance that a pixel on the bit's edge leaves open: it is half bright."""
 CONTRASTS = (0.25, 1.5)
 """Contrast of fringes over that of wide stripes: least that decodes, and most that gamma adds."""
+BLURS = (0.0, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5)
+"""Standard deviations of the blur of stripes that are tried, in steps of the table."""
+FITS_OF_GROUPS, VARIED_STRIPES = 2, 0.05
+"""Fits of the periods' contrasts and of each pixel's, in turns; and variance of stripes, of 0.25 at
+most, from which they give the scale."""
 GOOD = 0.3
 """Misfit, 1 - correlation^2, of a pixel that is explained: blur and gamma 2.2 leave 0.15."""
 LEAST_CONTRAST = 0.15
@@ -57,6 +62,9 @@ KEPT = 8
 """Hypotheses that are compared on all pixels, of those that the small sample ranks best."""
 SIGMAS = 5.0
 """Standard errors by which a hypothesis must explain more: one in two million by chance."""
+MOST_SKEWED = 1.5
+"""Factor by which the error of a gain that only a part of the pixels show is smaller than by their
+deviation: a dozen pixels are needed for it to be significant."""
 SIGMAS_OF_IMPOSSIBLE = 3.0
 """The same where it explains coordinates that run in an impossible direction as well."""
 EXPLAINED = 0.25
@@ -116,12 +124,20 @@ neighbour."""
 OUTSIDE, OUTSIDE_OF_CODE = 0.08, 0.02
 """Share of the coordinates beyond the projector, that noise of fine periods does not reach, and
 that wrong bits of a Gray code do not."""
+FEWEST_AT_EDGES = 15
+"""Pixels at edges of stripes, from which the displacement of a frame is known."""
+PAIR_SIGMAS = 3.0
+"""Standard errors, by their scatter, by which pairs of a bit and its inverse must move as well."""
 LEAST_MOTION = 0.015
 """Displacement from the first to the last step, in periods, that gamma and noise do not imitate."""
 JUMP_SHARE, JUMP_EXPLAINS, JUMP_SIGMAS, MOST_JUMP = 0.7, 0.5, 10.0, 0.2
 """The same of a displacement between two steps: its share of the steps' variance, and of the
 residual of the displaced steps; its standard errors, and periods that a step which shows another
 pattern exceeds. Measured, long periods of sound captures jump by at most 6 standard errors."""
+JUMP_OF_STRIPES = 0.9, 0.1
+"""Share of the variance, and of a cell, from which stripes show a jump although no bit was captured
+before it and its inverse after it; measured, sound captures reach 0.06 where they exceed the first.
+"""
 MUCH_MOTION = 0.03
 """The same, from which a capture must not be measured: a fringe is read to a hundredth."""
 USUAL_OFFSET = 0.02
@@ -151,16 +167,13 @@ stripes, which blur imitates and thresholds tolerate: alone, and beside fringes,
 it."""
 REPORTED = 0.03
 """Variation of the brightness, from the darkest to the brightest frame, that is reported."""
-FEWEST_RATES = 3
-"""Periods whose steps must agree about a steady change of the light: the scatter of two rates is
-not known."""
 FARTHEST_GAIN = 0.7
 """Logarithm of a gain over the median of its kind beyond which a frame shows something else."""
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
 """Rms of a wave along the rows, and change of the room's light over the mean grey level, that are
 corrected."""
 LEFT_BY_DRIFT = 0.5
-"""Part of the inequality of frames' means that a drift leaves at most: blurred stripes of dim
+"""Part of the inequality of frames' sums that a drift leaves at most: blurred stripes of dim
 captures are clipped more or less by their width, and imitate one in part."""
 SEEN_OF_ROWS, SEEN_WAVE = {"phase": 0.7, "gray": 0.25}, (0.5, 2.0)
 """Share of the variation of the rows' means that a wave must explain, and their amplitude over the

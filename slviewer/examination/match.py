@@ -19,14 +19,15 @@ from slviewer.examination.sample import Sample
 class Match:
     """Prediction of the p pixels of a sample.
 
-    ``images`` (k,): of the sample, described by the atoms at ``places`` (k,); ``coordinate`` (p,)
-    px: the mean of the two neighbours'; ``rise`` (p,) px: from the first to the second one;
-    ``predicted`` (k, p): pattern values; ``background``, ``contrast`` (p,): A and B; ``misfit``
-    (p,): 1 - correlation^2.
+    ``images`` (k,): of the sample, described by the ``atoms``, with blurred stripes, at ``places``
+    (k,); ``coordinate`` (p,) px: the mean of the two neighbours'; ``rise`` (p,) px: from the first
+    to the second one; ``predicted`` (k, p): pattern values; ``background``, ``contrast`` (p,): A
+    and B; ``misfit`` (p,): 1 - correlation^2.
     """
 
     images: list[int]
     places: list[int]
+    atoms: Atoms
     coordinate: np.ndarray
     rise: np.ndarray
     predicted: np.ndarray
@@ -73,11 +74,33 @@ def match(sample: Sample, atoms: Atoms, images: list[int | None]) -> Match:
     coordinate = _refine(scores, best.ravel()) * atoms.step_px + atoms.start_px
     first, second = coordinate.reshape(2, -1)
     middle, rise = (first + second) / 2, second - first
-    seen, predicted = levels[:, 1], atoms.at(middle)[places]
+    seen, groups = levels[:, 1], atoms.groups[places]
+    atoms = _blur_stripes(seen, atoms, middle, places)
+    pattern = atoms.at(middle)[places]
+    predicted = pattern
     misfit, background, contrast = _fit_levels(seen, predicted)
-    predicted = _fit_groups(seen, predicted, background, contrast, misfit, atoms.groups[places])
-    misfit, background, contrast = _fit_levels(seen, predicted)
-    return Match(there, places, middle, rise, predicted, background, contrast, misfit)
+    for _ in range(limits.FITS_OF_GROUPS):
+        predicted = _fit_groups(seen, pattern, background, contrast, misfit, groups)
+        misfit, background, contrast = _fit_levels(seen, predicted)
+    return Match(there, places, atoms, middle, rise, predicted, background, contrast, misfit)
+
+
+def _blur_stripes(
+    seen: np.ndarray, atoms: Atoms, coordinate: np.ndarray, places: list[int]
+) -> Atoms:
+    """Return the patterns with stripes as blurred as in levels (k, p) at coordinates (p,) px."""
+    groups = atoms.groups[places]
+    # of Gray code alone the table is as coarse as the cells, between which it is interpolated
+    stripes = np.flatnonzero(groups < 0) if groups.max() >= 0 else np.empty(0, int)
+    best, least = atoms, np.inf
+    for blur in limits.BLURS if stripes.size else ():
+        blurred = atoms.blurred(blur * atoms.step_px)
+        patterns = blurred.at(coordinate)[np.array(places)[stripes]]
+        misfit = float(_fit_levels(seen[stripes], patterns)[0].mean())
+        if misfit > least:
+            break
+        best, least = blurred, misfit
+    return best
 
 
 def _fit_levels(
@@ -107,12 +130,21 @@ def _fit_groups(
     """
     good = misfit < np.quantile(misfit, 0.7)
     relative = (seen[:, good] - background[good]) / np.maximum(contrast[good], 1e-3)
+    relative = np.clip(relative, -1, 2)
     out = predicted.copy()
+    if not good.any():
+        return out
+    stripes = groups < 0
+    x, y = predicted[stripes][:, good], relative[stripes]
+    if x.size and x.var() > limits.VARIED_STRIPES:  # they are what fringes are compared with
+        slope = np.mean((x - x.mean()) * (y - y.mean())) / x.var()
+        slope = np.float32(np.clip(slope, 1 / limits.CONTRASTS[1], limits.CONTRASTS[1]))
+        relative = (relative - y.mean()) / slope + x.mean()
     for group in range(groups.max() + 1):
         own = groups == group
-        if np.count_nonzero(own) < 3 or not good.any():
+        if np.count_nonzero(own) < 3:
             continue
-        x, y = predicted[own][:, good].ravel(), np.clip(relative[own].ravel(), -1, 2)
+        x, y = predicted[own][:, good].ravel(), relative[own].ravel()
         middle, spread = x.mean(), np.float32(max(float(x.var()), 1e-3))
         slope = np.mean((x - middle) * (y - y.mean())) / spread
         slope = np.float32(np.clip(slope, *limits.CONTRASTS))

@@ -12,6 +12,7 @@ from slviewer.examination import limits
 from slviewer.examination.atoms import evaluate_frame, tabulate_atoms
 from slviewer.examination.evaluate import Evaluator, Hypothesis, described
 from slviewer.examination.explain import explain, list_unresolved
+from slviewer.examination.frame_means import measure_drift
 from slviewer.examination.ghost import has_ghost, measure_ghost
 from slviewer.examination.hypotheses import exchange, list_descriptions, list_orders
 from slviewer.examination.motion import measure_motion
@@ -110,8 +111,9 @@ def test_compare_prefers_the_truth(name: str) -> None:
 
 
 def move(sequence: PatternSequence, px: float) -> np.ndarray:
-    """Frames of a scene whose pattern moves steadily by ``px`` over the phase steps of x."""
-    steps = sequence.find("phase", "x")
+    """Frames of a scene whose pattern moves steadily by ``px`` over the phase steps of x, or over
+    the bits."""
+    steps = sequence.find("phase", "x") or sequence.select("x")
     stack = capture(sequence, COORDINATE)
     for place, i in enumerate(steps):
         shift = px * (place / (len(steps) - 1) - 0.5)
@@ -127,8 +129,35 @@ def test_motion_is_measured(px: float) -> None:
     assert 0.45 < -measured / px < 1.0
 
 
+def test_motion_of_stripes_is_measured_between_bits_and_inverses() -> None:
+    evaluator, base = prepare("gray", move(one_axis("gray"), 2.0))
+    (measured,) = measure_motion(evaluator, base).values()
+    assert 0.45 < -measured / 2.0 < 1.3
+
+
+@pytest.mark.parametrize("defocus", [0.8, 2.5])
+def test_blur_of_stripes_and_gamma_leave_little(defocus: float) -> None:
+    stack = capture(one_axis("p18"), COORDINATE, defocus=defocus, gamma=1.6)
+    evaluator, base = prepare("p18", stack)
+    m = evaluator.match(base, "x")
+    assert m is not None and 0 < np.median(m.misfit) < 0.003
+    assert 0.98 * 180 < np.median(m.contrast) < 1.02 * 180  # that of wide stripes
+
+
+@pytest.mark.parametrize("share", [-0.3, 0.06])
+def test_a_drift_is_measured_in_sums_that_are_equal(share: float) -> None:
+    sequence = SEQUENCES["complementary"]
+    stack = capture(sequence, COORDINATE).astype(float)
+    own = sequence.select("y")
+    stack[own] = capture(sequence, COORDINATE, axis="y")[own]
+    assert measure_drift(sequence, stack) == 0
+    gains = np.exp(np.linspace(0, share, len(stack)))
+    rate = measure_drift(sequence, stack * gains[:, None, None])
+    assert rate == pytest.approx(share / (len(stack) - 1), rel=0.05)
+
+
 @pytest.mark.parametrize("gamma", [1.0, 1.6])
-@pytest.mark.parametrize("name", ["p18", "complementary", "multifrequency"])
+@pytest.mark.parametrize("name", ["p18", "gray", "complementary", "multifrequency"])
 def test_a_sound_capture_neither_moves_nor_has_a_ghost(name: str, gamma: float) -> None:
     stack = capture(one_axis(name), COORDINATE, gamma=gamma, shot=0.02)
     evaluator, base = prepare(name, stack)
