@@ -136,8 +136,8 @@ residual of the displaced steps; its standard errors, and periods that a step wh
 pattern exceeds. Measured, long periods of sound captures jump by at most 6 standard errors."""
 JUMP_OF_STRIPES = 0.9, 0.1
 """Share of the variance, and of a cell, from which stripes show a jump although no bit was captured
-before it and its inverse after it; measured, sound captures reach 0.06 where they exceed the first.
-"""
+before it and its inverse after it, and the share of a cell from which they show a steady motion;
+measured, blur and gamma reach 0.06 of a cell in sound captures, and motion from 0.15."""
 MUCH_MOTION = 0.03
 """The same, from which a capture must not be measured: a fringe is read to a hundredth."""
 USUAL_OFFSET = 0.02

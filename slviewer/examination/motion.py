@@ -21,20 +21,24 @@ def measure_motion(evaluator: Evaluator, base: Hypothesis) -> dict[Axis, float]:
     out = dict[Axis, float]()
     for axis, steps in _measure_steps(evaluator, base):
         period, every = base.sequence.period_px(axis), np.arange(len(steps.shift))
+        has_steps = bool(base.sequence.phase_shifts(axis))
+        share, least_px = limits.JUMP_OF_STRIPES[0], limits.JUMP_OF_STRIPES[1] * period
         steady = steps.fit(every / len(every))
-        if steady.is_clear(limits.SIGMAS, period) and steps.confirms(steady):
+        if (
+            steady.is_clear(limits.SIGMAS, period)
+            and steps.confirms(steady)
+            and (has_steps or abs(steady.px) > least_px)
+        ):
             out[axis] = steady.px
         jump = max((steps.fit(every >= k) for k in every[1:]), key=lambda fitted: fitted.share)
         displaced = jump.shape
         if steps.weight[displaced].sum() > steps.weight.sum() / 2:
             displaced = ~displaced
         is_jump = jump.share > max(limits.JUMP_SHARE, steady.share) and steps.explains(displaced)
-        if base.sequence.phase_shifts(axis):
+        if has_steps:
             is_jump &= abs(jump.px) < limits.MOST_JUMP * period
         else:
-            share, least = limits.JUMP_OF_STRIPES
-            is_clear = jump.share > share and abs(jump.px) > least * period
-            is_jump &= is_clear or steps.confirms(jump)
+            is_jump &= (jump.share > share and abs(jump.px) > least_px) or steps.confirms(jump)
         if is_jump and jump.is_clear(limits.JUMP_SIGMAS, period):
             out[axis] = jump.px
     return out
