@@ -34,11 +34,13 @@ def measure_motion(evaluator: Evaluator, base: Hypothesis) -> dict[Axis, float]:
         displaced = jump.shape
         if steps.weight[displaced].sum() > steps.weight.sum() / 2:
             displaced = ~displaced
-        is_jump = jump.share > max(limits.JUMP_SHARE, steady.share) and steps.explains(displaced)
+        is_jump = jump.share > max(limits.JUMP_SHARE, steady.share)
+        explains, confirms = steps.explains(displaced), steps.confirms(jump)
         if has_steps:
-            is_jump &= abs(jump.px) < limits.MOST_JUMP * period
-        else:
-            is_jump &= (jump.share > share and abs(jump.px) > least_px) or steps.confirms(jump)
+            is_jump &= explains and abs(jump.px) < limits.MOST_JUMP * period
+        else:  # two of three: blur may leave more at the stripes' edges than a jump does
+            is_large = jump.share > share and abs(jump.px) > least_px
+            is_jump &= explains + confirms + is_large >= 2
         if is_jump and jump.is_clear(limits.JUMP_SIGMAS, period):
             out[axis] = jump.px
     return out
