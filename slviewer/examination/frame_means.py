@@ -44,14 +44,17 @@ def measure_drift(sequence: PatternSequence, stack: np.ndarray) -> float:
     """Return by how much the logarithm of the light grows from frame to frame; 0 where the means
     do not show it, or it is too little to be reported.
 
-    What imitates gains depends on the pattern, and a drift of the light on time alone: the sums of
+    What imitates gains depends on the pattern, and a drift of the light on time alone: the means of
     a bit and its inverse, and of all steps of a period, are equal whatever they show.
     """
-    *_, sums = [np.empty((0, 0), int), *_list_equal_sums(sequence)]
-    if sums.shape[1] < 2:
+    *_, last = [np.empty((0, 0), int), *_list_equal_sums(sequence)]
+    shifts = list_shifts(sequence)
+    equal = shifts if len(shifts) > 1 else [*last]
+    if len(equal) < 2 or len(equal[0]) < 2:
         return 0.0
-    time = sums.mean(axis=1)
-    logs = np.log(np.maximum(_measure_means(stack)[sums].mean(axis=1), 1e-6))
+    means = _measure_means(stack)
+    time = np.array([np.mean(members) for members in equal])
+    logs = np.log([max(means[[*members]].mean(), 1e-6) for members in equal])
     rate, start = np.polyfit(time, logs, 1)
     left, whole = np.std(logs - rate * time - start), np.std(logs)
     is_steady = left < limits.LEFT_BY_DRIFT * whole
