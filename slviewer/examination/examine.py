@@ -61,19 +61,22 @@ def _judge(
     if not sample.is_usable and (sample.by_axis or sample.lit < limits.LEAST_LIT):
         return [describe_missing_pattern(sample)]
     ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
-    found = explain(evaluator, base)
-    if motion and _are_displaced(evaluator, found):
+    found, coordinates = explain(evaluator, base), [*_judge_coordinates(evaluator, base)]
+    if coordinates and _is_motion(found):  # codes that cannot be are displaced as well
         found = ()
-    if found and not (ghost and _is_like_ghost(found)):
+    if found and not _is_imitated(found, evaluator, bool(ghost), bool(motion)):
         return _describe_explanation(found, evaluator, base)
-    coordinates = [*_judge_coordinates(evaluator, base)]
-    # codes that cannot be are displaced as well
     if motion and not ghost and not coordinates:
         return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
     judged = [*_judge_readability(evaluator, base), *coordinates]
     if ghost:  # it imitates other light
         return [*judged, describe_ghost(ghost)]
     return [*judged, *(_judge_light(sequence, stack, light) if not coordinates else ())]
+
+
+def _is_imitated(found: Explanation, evaluator: Evaluator, ghost: bool, motion: bool) -> bool:
+    """Return whether motion, or a ghost, that was measured imitates an explanation."""
+    return (motion and _are_displaced(evaluator, found)) or (ghost and _is_like_ghost(found))
 
 
 def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evaluator:
@@ -95,11 +98,15 @@ def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evalu
     return evaluator if rivals and max(rivals) < equal.compare(base, base).loss else equal
 
 
+def _is_motion(found: Explanation) -> bool:
+    """Return whether an explanation is a motion."""
+    return bool(found) and found[0].cause == "moved"
+
+
 def _is_like_ghost(found: Explanation) -> bool:
     """Return whether ghosts imitate an explanation: motion, beside which they are measured, and one
     strange frame, as the first image, which has none before it, stands out."""
-    first, *others = found
-    return first.cause == "moved" or (first.cause == "duplicate-frame" and not others)
+    return _is_motion(found) or [each.cause for each in found] == ["duplicate-frame"]
 
 
 def _are_displaced(evaluator: Evaluator, found: Explanation) -> bool:

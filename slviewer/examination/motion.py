@@ -16,7 +16,8 @@ def measure_motion(evaluator: Evaluator, base: Hypothesis) -> dict[Axis, float]:
     significant, px of the projector: steady, from the first to the last step, or all at once.
 
     Light that varies displaces no step, and a step that shows another pattern displaces one, by
-    more than a jump may have. Edges of stripes are predicted wrongly by a part of a cell.
+    more than a jump may have. Edges of stripes are predicted wrongly by a part of a cell, so that a
+    steady motion must explain most of their displacements.
     """
     out = dict[Axis, float]()
     for axis, steps in _measure_steps(evaluator, base):
@@ -27,7 +28,7 @@ def measure_motion(evaluator: Evaluator, base: Hypothesis) -> dict[Axis, float]:
         if (
             steady.is_clear(limits.SIGMAS, period)
             and steps.confirms(steady)
-            and (has_steps or abs(steady.px) > least_px)
+            and (has_steps or (abs(steady.px) > least_px and steady.share > 0.5))
         ):
             out[axis] = steady.px
         jump = max((steps.fit(every >= k) for k in every[1:]), key=lambda fitted: fitted.share)
