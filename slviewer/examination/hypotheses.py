@@ -29,9 +29,9 @@ def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
     n = len(sequence.frames)
     for lag in (1, 2, 3, -1):
         images = [i + lag if 0 <= i + lag < n else None for i in range(n)]
-        # that all frames are moved is no more to assume than that some are
-        cost = PER_FRAME_COST + LOST_COST * abs(lag)
-        yield replace(_order("frame-lag", sequence, images, value=lag), cost=cost)
+        hypothesis = _order("frame-lag", sequence, images, value=lag)
+        # what the lost images show is not explained
+        yield replace(hypothesis, cost=hypothesis.cost + LOST_COST * abs(lag))
     kinds = [frame.kind for frame in sequence.frames]
     yield from (
         exchange(sequence, k, k + 1) for k in range(n - 1) if "texture" not in kinds[k : k + 2]
@@ -162,11 +162,13 @@ def _order(
     frames: tuple[int, ...] = (),
     value: float | None = None,
 ) -> Hypothesis:
-    """Return the hypothesis of an order, which costs by the frames that it moves and loses."""
+    """Return the hypothesis of an order, which costs by the frames that it moves and loses; frames
+    that are late or early from one on are moved by one event."""
     hypothesis = Hypothesis(cause, sequence, tuple(images), frames, value=value)
     changed = hypothesis.changed
     lost = sum(images[i] is None for i in changed)
-    return replace(hypothesis, cost=PER_FRAME_COST * len(changed) + LOST_COST * lost)
+    events = 1 if cause in ("frame-lag", "missing-frame") else len(changed)
+    return replace(hypothesis, cost=PER_FRAME_COST * events + LOST_COST * lost)
 
 
 def list_descriptions(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothesis]:
