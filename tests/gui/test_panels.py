@@ -191,6 +191,7 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     click(page, "6. Scan")
     for name in ("object_r1", "object_r2"):
         choose(page, "Scan", name)
+        page.wait_for_timeout(1000)  # a busy program may take the click before the choice
         click(page, "Reconstruct")
         assert operator.wait_for(lambda s, name=name: s.scan(name).cloud == "fresh", PATIENCE_S)  # type: ignore[misc]
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
