@@ -137,7 +137,7 @@ class Evaluator:
                 losses.append(loss[0])
         gain = np.concatenate(gains)
         mean = float(gain.mean())
-        # chance loses as often as it gains: few pixels that gain much are no sign of it
+        # chance loses as often as it gains, so that a few large gains are not significant
         chance = np.sqrt(2 * np.mean(np.minimum(gain, 0) ** 2))
         error = max(float(chance), float(gain.std()) / limits.MOST_SKEWED) / np.sqrt(len(gain))
         every = np.concatenate(losses)

@@ -137,7 +137,10 @@ pattern exceeds. Measured, long periods of sound captures jump by at most 6 stan
 JUMP_OF_STRIPES = 0.9, 0.1
 """Share of the variance, and of a cell, from which stripes show a jump although no bit was captured
 before it and its inverse after it, and the share of a cell from which they show a steady motion;
-measured, blur and gamma reach 0.06 of a cell in sound captures, and motion from 0.15."""
+measured, blur and gamma reach 0.06 of a cell where bits are resolved, and motion from 0.15."""
+STEADY_OF_STRIPES = 0.5
+"""Share of the displacements of stripes that a steady motion explains at least; measured, motion
+explains from 0.57, and stripes that are not resolved imitate one that explains 0.33."""
 MUCH_MOTION = 0.03
 """The same, from which a capture must not be measured: a fringe is read to a hundredth."""
 USUAL_OFFSET = 0.02

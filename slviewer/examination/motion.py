@@ -25,11 +25,9 @@ def measure_motion(evaluator: Evaluator, base: Hypothesis) -> dict[Axis, float]:
         has_steps = bool(base.sequence.phase_shifts(axis))
         share, least_px = limits.JUMP_OF_STRIPES[0], limits.JUMP_OF_STRIPES[1] * period
         steady = steps.fit(every / len(every))
-        if (
-            steady.is_clear(limits.SIGMAS, period)
-            and steps.confirms(steady)
-            and (has_steps or (abs(steady.px) > least_px and steady.share > 0.5))
-        ):
+        is_large = abs(steady.px) > least_px and steady.share > limits.STEADY_OF_STRIPES
+        is_steady = steady.is_clear(limits.SIGMAS, period) and steps.confirms(steady)
+        if is_steady and (has_steps or is_large):
             out[axis] = steady.px
         jump = max((steps.fit(every >= k) for k in every[1:]), key=lambda fitted: fitted.share)
         displaced = jump.shape

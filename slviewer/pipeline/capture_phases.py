@@ -340,8 +340,8 @@ def look_at_capture(capture: Capture) -> Look:
 def compute_ahead(
     compute: Callable[[T], Computed], items: Sequence[T], at_once: int = 1
 ) -> Iterator[tuple[T, Future[Computed]]]:
-    """Yield items with what is computed of them, whose `result()` may raise; the next ones',
-    ``at_once``, are computed while one is processed."""
+    """Yield items with what is computed of them, whose `result()` may raise; the next ``at_once``
+    items are computed while one is processed."""
     with ThreadPoolExecutor(at_once) as worker:
         ahead = [worker.submit(compute, item) for item in items[:at_once]]
         for i, item in enumerate(items):

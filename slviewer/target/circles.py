@@ -436,31 +436,36 @@ def _fit_paper_level(place, level, ring, ink):
     share = 0.75 if ink < _quantile(level, ring, 0.5) else 0.25
     ground = _quantile(level, ring, share)
     contrast = abs(ground - ink)
-    off, near = np.empty_like(level), ring
     plane = _fit_plane(place, level, ring)
-    for step in range(4):
-        worst = 0.0
+    off, near = np.empty_like(level), np.empty_like(ring)
+    if _measure_off(plane, place, level, ring, off) < FLATNESS * contrast:
+        return plane
+    for i in range(len(level)):
+        off[i] = abs(level[i] - ground)
+    gate = INITIAL_GATE * contrast
+    for _ in range(3):
+        count = 0
         for i in range(len(level)):
-            off[i] = abs(level[i] - _plane_at(plane, place, i))
-            if ring[i]:
-                worst = max(worst, off[i])
-        if step == 3 or (step == 0 and worst < FLATNESS * contrast):
-            return plane
-        gate = INITIAL_GATE * contrast
-        if step > 0:
-            gate = max(GATE_SIGMAS * 1.4826 * _quantile(off, near, 0.5), FLATNESS * contrast)
-        count, within = 0, np.empty_like(ring)
-        for i in range(len(level)):
-            is_near = (
-                abs(level[i] - ground) < INITIAL_GATE * contrast if step == 0 else off[i] < gate
-            )
-            within[i] = ring[i] and is_near
-            count += within[i]
-        near = within
+            near[i] = ring[i] and off[i] < gate
+            count += near[i]
         if count < MIN_RING_PIXELS:
-            return plane
+            break
         plane = _fit_plane(place, level, near)
+        _measure_off(plane, place, level, ring, off)
+        gate = max(GATE_SIGMAS * 1.4826 * _quantile(off, near, 0.5), FLATNESS * contrast)
     return plane
+
+
+@kernel()
+def _measure_off(plane, place, level, ring, off):
+    """Fill ``off`` (n,) with how far the ``level`` (n,) is from a plane; return the largest in the
+    ``ring`` (n,)."""
+    worst = 0.0
+    for i in range(len(level)):
+        off[i] = abs(level[i] - _plane_at(plane, place, i))
+        if ring[i]:
+            worst = max(worst, off[i])
+    return worst
 
 
 @kernel()
