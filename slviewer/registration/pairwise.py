@@ -252,15 +252,17 @@ def _find_rival(
 ) -> Registration | None:
     """Return the result of ICP from the first of the ``others`` that ends at a different pose, and
     fits as well; ``score``: of the result's own start."""
+    nearest = RIVAL_GATES * result.gate_mm
     for other in others:
-        if not other.score >= RIVAL_SCORE * score:
+        gap = pose_distance(scan.fine_points, result.T_reference_scan, other.T)
+        if gap <= nearest or not other.score >= RIVAL_SCORE * score:
             continue
         try:
             rival = _refine_start(scan, reference, other, size)
         except Refused:
             continue
         gap = pose_distance(scan.fine_points, result.T_reference_scan, rival.T_reference_scan)
-        distinct = gap > max(RIVAL_GATES * result.gate_mm, 10.0 * result.uncertainty.shift_mm)
+        distinct = gap > max(nearest, 10.0 * result.uncertainty.shift_mm)
         alike = (
             rival.overlap >= RIVAL_OVERLAP * result.overlap
             and rival.rms_mm <= RIVAL_RMS * result.rms_mm

@@ -73,7 +73,7 @@ class PreparedScan:
     @cached_property
     def tree(self) -> cKDTree:
         """Search tree of all points."""
-        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+        return cKDTree(self.points, 32, balanced_tree=False, compact_nodes=False)
 
     @cached_property
     def fine_points(self) -> Floats:
