@@ -10,7 +10,9 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import MISSING, fields
+from difflib import get_close_matches
 from functools import partial
+from textwrap import fill
 from typing import Any
 
 import tyro
@@ -28,7 +30,6 @@ from slviewer.commands.command import (
     read_command,
     show_result,
     take_options,
-    union,
 )
 from slviewer.commands.runs import (
     make_import_command,
@@ -39,7 +40,7 @@ from slviewer.commands.runs import (
     run_turn,
     wizard,
 )
-from slviewer.errors import Cancelled, SlviewerError
+from slviewer.errors import Cancelled, SlviewerError, UsageError
 
 
 def _run_simulate(simulate: Function, arguments: Arguments) -> None:
@@ -72,9 +73,13 @@ CONFIG = (
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.PositionalMetavarFromFieldName,
 )
-DESCRIPTION = (
-    "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."
-)
+DESCRIPTION = """usage: slviewer COMMAND ...
+
+Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge.
+`slviewer COMMAND --help` explains a command; without one the wizard starts in the browser.
+"""
+WIDTH, INDENT = 88, 18
+"""Columns of the list of commands, and those of their names."""
 PAGES = ("commands.runs:PageOptions",)
 MESHING = ("surface.meshing:MeshingPlan",)
 MESHING_NAMES = {"fill_holes_mm": "fill_holes"}
@@ -174,17 +179,27 @@ COMMANDS: dict[str, Callable[[], Function]] = {
 """The commands by name, each made when it is used: that reads the source of its function."""
 
 
-def make_command(name: str) -> Function | None:
+def make_command(name: str) -> Function:
     """Return the command of that name, also of an operation that is registered in this process,
-    whose settings without defaults are positional; None where there is none."""
+    whose settings without defaults are positional. Raises UsageError where there is none."""
     if name in COMMANDS:
         return COMMANDS[name]()
     operation = getattr(sys.modules.get("slviewer.pipeline.operation"), "OPERATIONS", {}).get(name)
     if operation is None:
-        return None
+        near = "".join(f" (did you mean {each}?)" for each in get_close_matches(name, COMMANDS, 1))
+        raise UsageError(f"there is no command {name}{near}: `slviewer --help` lists them")
     required = [each.name for each in fields(operation.settings) if each.default is MISSING]
     source = f"{operation.function.__module__}:{operation.function.__name__}"
     return read_command(source, *required, options=JSON)
+
+
+def list_commands() -> str:
+    """Return all commands, each with the first paragraph of its description."""
+    lines = [DESCRIPTION]
+    for name, make in COMMANDS.items():
+        text = " ".join((make().__doc__ or "").split("\n\n")[0].split())
+        lines.append(fill(f"  {name:{INDENT - 2}}{text}", WIDTH, subsequent_indent=" " * INDENT))
+    return "\n".join(lines)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -193,22 +208,12 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments:
         arguments = ["wizard"]
-    if arguments == ["--version"]:
-        print(f"slviewer {__version__}")
-        return 0
     name, *rest = arguments
     try:
-        if (command := make_command(name)) is not None:
-            run = tyro.cli(command, prog=f"slviewer {name}", args=rest, config=CONFIG)
-        else:
-            run = tyro.cli(
-                union({each: make() for each, make in COMMANDS.items()}),
-                prog="slviewer",
-                description=DESCRIPTION,
-                args=arguments,
-                config=CONFIG,
-            )
-        run()
+        if arguments in (["--version"], ["-h"], ["--help"]):
+            print(f"slviewer {__version__}" if name == "--version" else list_commands())
+            return 0
+        tyro.cli(make_command(name), prog=f"slviewer {name}", args=rest, config=CONFIG)()
     except SystemExit as stop:
         return int(stop.code or 0)
     except SlviewerError as error:

@@ -34,7 +34,7 @@ LIMITS = {
     "reconstruct again in the same process": 0.1,
     "`slviewer reconstruct` as a command": 1.2,
     f"`slviewer validate` on {POSES} poses": 60.0,
-    "`slviewer --help`": 0.4,
+    "`slviewer --help`": 0.25,
     "first judged pose after installation": 8.0,
     "Autopilot after installation": 90.0,
     "`slviewer reproduce --quick` after installation": 60.0,

@@ -43,7 +43,7 @@ def test_help_imports_nothing_heavy_and_lists_every_command() -> None:
     run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     listing = run.stdout[: run.stdout.index("usage: slviewer import")]
-    assert all(f"• {name} " in listing for name in COMMANDS)
+    assert all(f"\n  {name} " in listing for name in COMMANDS)
 
 
 def test_a_command_has_the_arguments_that_its_functions_docstring_describes(
@@ -100,3 +100,10 @@ WIDTH: int = 4
     assert module.find_node("NAME") is None
     definition = module.find_node("last")
     assert isinstance(definition, ast.FunctionDef) and len(definition.decorator_list) == 1
+
+
+def test_an_unknown_command_is_refused_with_the_nearest_one(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["reconstuct"]) == 2
+    assert "did you mean reconstruct?" in capsys.readouterr().err
