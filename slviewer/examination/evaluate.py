@@ -1,10 +1,12 @@
 """Evaluation of hypotheses about a capture on its sample."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from slviewer.examination import limits
 from slviewer.examination.atoms import Atoms, tabulate_atoms
@@ -56,6 +58,17 @@ class Hypothesis:
         """The one frame that no image shows, if all others are in place; else None."""
         changed = self.changed
         return changed[0] if len(changed) == 1 and self.images[changed[0]] is None else None
+
+
+@cache
+def _find_blas() -> ThreadpoolController:
+    """Return what limits NumPy's threads; it reads the list of the loaded libraries, 3 ms."""
+    return ThreadpoolController()
+
+
+def use_one_thread() -> AbstractContextManager[object]:
+    """Return the context of work on a sample, whose products are too small for more threads."""
+    return _find_blas().limit(limits=1, user_api="blas")
 
 
 def described(sequence: PatternSequence) -> Hypothesis:

@@ -4,11 +4,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from slviewer.errors import InputError
 from slviewer.examination import limits
-from slviewer.examination.evaluate import Evaluator, Hypothesis, described
+from slviewer.examination.evaluate import Evaluator, Hypothesis, described, use_one_thread
 from slviewer.examination.explain import Explanation, explain, list_unresolved
 from slviewer.examination.findings import (
     REMEDIES,
@@ -48,7 +47,7 @@ def examine(sequence: PatternSequence, stack: np.ndarray, look: Look | None = No
     if not sequence.axes:
         return Examination()
     base, light = described(sequence), look.light
-    with threadpool_limits(1, "blas"):  # the products of a sample are too small for more
+    with use_one_thread():
         findings = _judge(stack, _correct(look.evaluator, base, light), base, light)
     return Examination(tuple(findings), light.drift)
 

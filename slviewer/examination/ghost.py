@@ -19,20 +19,20 @@ def measure_ghost(evaluator: Evaluator, base: Hypothesis) -> tuple[float, float]
     for axis, sample, m, good in evaluator.explained(base):
         slope = evaluator.atoms(base, axis).slope_at(m.coordinate[good])[m.places]
         A, B, d = m.background[good], m.contrast[good], m.predicted[:, good]
-        residuals = m.residual(sample)[:, good] / B
-        for k, i in enumerate(m.images):
-            if i == 0:
-                continue
-            own = np.stack([(A + B * d[k]) / B, np.ones_like(B), slope[k]])
-            measured = (sample.levels[i - 1, 1][good] - A) / B
-            before = d[m.images.index(i - 1)] if i - 1 in m.images else measured
-            both = np.stack([before - d[k], residuals[k]])
-            fit, *_ = np.linalg.lstsq(own.T, both.T, rcond=1e-4)
-            x, r = both - fit.T @ own
-            usable = np.abs(x) < 1.5  # of the contrast; more is another surface's
-            weight = 1 / (float(r.var()) + 1e-6)
-            normal += weight * float(x[usable] @ x[usable])
-            moment += weight * float(x[usable] @ r[usable])
+        later = [k for k, i in enumerate(m.images) if i > 0]
+        images = np.array(m.images)[later] - 1
+        before = (sample.levels[images, 1][:, good] - A) / B
+        known = np.flatnonzero(np.isin(images, m.images))
+        before[known] = d[[m.images.index(i) for i in images[known]]]
+        own = np.stack([A / B + d, np.ones_like(d), slope])[:, later].astype(float)
+        both = np.stack([before - d[later], (m.residual(sample)[:, good] / B)[later]])
+        squares, products = (np.einsum("akp,bkp->kab", own, each) for each in (own, both))
+        fit = np.linalg.pinv(squares, 1e-8, hermitian=True) @ products
+        x, r = both - np.einsum("kab,akp->bkp", fit, own)
+        weight = 1 / (r.var(axis=1) + 1e-6)
+        usable = np.where(np.abs(x) < 1.5, x, 0)  # of the contrast; more is another surface's
+        normal += float(weight @ np.einsum("kp,kp->k", usable, usable))
+        moment += float(weight @ np.einsum("kp,kp->k", usable, r))
     return moment / normal, normal**-0.5
 
 

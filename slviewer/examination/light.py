@@ -11,10 +11,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from slviewer.examination import limits
-from slviewer.examination.evaluate import Evaluator, Hypothesis, described
+from slviewer.examination.evaluate import Evaluator, Hypothesis, described, use_one_thread
 from slviewer.examination.frame_means import (
     evaluate_waves,
     measure_drift,
@@ -67,7 +66,7 @@ def look_at(sequence: PatternSequence, stack: np.ndarray) -> Look:
     if not sequence.axes:
         nothing = Evaluator(CaptureSample({}, 0.0, 0.0, 0.0, 0.0, 0.0))
         return Look(stack, nothing, FrameLight.constant(len(stack)))
-    with threadpool_limits(1, "blas"):  # the products of a sample are too small for more
+    with use_one_thread():
         evaluator = Evaluator(sample_capture(sequence, stack))
         return Look(stack, evaluator, estimate_light(evaluator, described(sequence), stack))
 
