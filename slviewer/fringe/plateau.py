@@ -55,19 +55,21 @@ def find_plateau(levels: np.ndarray, full_scale: float) -> float | None:
 def _find_end(counts: np.ndarray, width: int) -> int:
     """Return the bin behind a plateau of ``width`` bins, by the samples in each from the brightest
     level down; 0 where there is none."""
-    total = [0, *np.cumsum(counts[: 12 * max(WIDTHS)]).tolist()]
-    for first in range(2 * max(WIDTHS)):
-        at = [min(first + width * k, len(total) - 1) for k in (0, 1, 2, 10)]
-        above, end, following, ninth = (total[k] for k in at)
-        own = end - above
-        least = max(FEWEST_SAMPLES, OVER_NEXT * (following - end), OVER_NINE * (ninth - end))
-        if own >= least and above <= ABOVE * own:
-            below = counts[at[1] :][:COMPARED]
-            if np.count_nonzero(below) < COMPARED * OCCUPIED:
-                return 0
-            is_comb = below.max() * COMB > max(own, COMB * COMB * np.median(below))
-            return 0 if is_comb else int(at[1])
-    return 0
+    total = np.concatenate([[0], np.cumsum(counts[: 12 * max(WIDTHS)])])
+    first = np.arange(2 * max(WIDTHS))[:, None]
+    at = np.minimum(first + width * np.array([0, 1, 2, 10]), len(total) - 1)
+    above, end, following, ninth = total[at].T
+    own = end - above
+    beside = np.maximum(OVER_NEXT * (following - end), OVER_NINE * (ninth - end))
+    found = np.flatnonzero((own >= np.maximum(beside, FEWEST_SAMPLES)) & (above <= ABOVE * own))
+    if not found.size:
+        return 0
+    stop = int(at[found[0], 1])
+    below = counts[stop:][:COMPARED]
+    if np.count_nonzero(below) < COMPARED * OCCUPIED:
+        return 0
+    is_comb = below.max() * COMB > max(own[found[0]], COMB * COMB * np.median(below))
+    return 0 if is_comb else stop
 
 
 def _has_between(below: np.ndarray, end: float) -> bool:

@@ -22,10 +22,9 @@ def fringe_mean(layout: Layout, stack: np.ndarray) -> float:
     """
     if layout.inverse or not (layout.shifts and layout.gray):
         return MIDDLE
-    fringes = sample(stack, layout.shifts[-1].indices).astype(np.float32)
-    heights = sample(stack, layout.gray).astype(np.float32) - fringes.mean(axis=0)
-    swing = 0.25 * (fringes.max(axis=0) - fringes.min(axis=0))
-    above, below = heights.max(axis=0), -heights.min(axis=0)
+    fringes, bits = (sample(stack, indices) for indices in (layout.shifts[-1].indices, layout.gray))
+    mean, swing = fringes.mean(axis=0, dtype=np.float32), 0.25 * np.ptp(fringes, axis=0)
+    above, below = bits.max(axis=0) - mean, mean - bits.min(axis=0)
     both = (above > swing) & (below > swing) & (swing > 1)
     if np.count_nonzero(both) < 100:
         return MIDDLE
