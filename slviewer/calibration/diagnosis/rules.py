@@ -485,40 +485,40 @@ def diagnose_pose_count(e: Evidence) -> Iterator[Finding]:
 
 
 def diagnose_parallel_poses(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where the boards of all poses are nearly parallel."""
+    """Yield a finding where the boards of all poses are nearly parallel; rejected also where that
+    leaves a focal length unknown."""
     solved = None if e.tilts_undetermined else e.solution
     spread = solved.tilt_spread_deg if solved else e.tilt_spread_deg
     if e.is_camera_fixed or not spread < MIN_TILT_DEG or len(e.usable) < MIN_POSES:
         return
-    rejected = spread < MIN_TILT_SPREAD_DEG or solved is None or bool(e.refusal)
-    yield Finding(
-        "parallel-poses",
-        "rejected" if rejected else "doubtful",
+    rejected = spread < MIN_TILT_SPREAD_DEG or solved is None or e.refusal or _is_focal_unknown(e)
+    text = (
         f"all {len(e.solution.used if e.solution else e.usable)} poses are nearly parallel "
-        f"(tilts differ by {spread:.1f} degrees, and should by {MIN_TILT_DEG:.0f} at least)",
-        "tilt the board by 15 to 30 degrees, in different directions",
+        f"(tilts differ by {spread:.1f} degrees, and should by {MIN_TILT_DEG:.0f} at least)"
     )
+    remedy = "tilt the board by 15 to 30 degrees, in different directions"
+    yield Finding("parallel-poses", "rejected" if rejected else "doubtful", text, remedy)
+
+
+def _is_focal_unknown(e: Evidence) -> bool:
+    """Return whether the poses leave a focal length so uncertain that nothing can be measured, and
+    a large reprojection error, whose consequence it may be, does not explain it."""
+    if e.solution is None or e.solution.reprojection_px > HIGH_REPROJECTION_PX:
+        return False
+    return not all(sigma < MAX_FOCAL_SIGMA for sigma in e.solution.focal_sigma.values())
 
 
 def diagnose_solution(e: Evidence) -> Iterator[Finding]:
     """Yield findings on corners of the image that no pose covers, on a large reprojection error,
-    and on focal lengths that the poses leave uncertain.
-
-    With a large reprojection error an uncertain focal length is at most doubtful: it may be a
-    consequence.
-    """
+    and on focal lengths that the poses leave uncertain."""
     if e.solution is None:
         return
     if e.solution.empty_corners:
         where = " and ".join(", ".join(e.solution.empty_corners).rsplit(", ", 1))
-        yield Finding(
-            "empty-corner",
-            "doubtful",
-            f"no pose reaches the {where} of the image, where lenses bend the most",
-            f"capture poses that reach into the {where}",
-        )
-    is_misfit = e.solution.reprojection_px > HIGH_REPROJECTION_PX
-    if is_misfit:
+        text = f"no pose reaches the {where} of the image, where lenses bend the most"
+        remedy = f"capture poses that reach into the {where}"
+        yield Finding("empty-corner", "doubtful", text, remedy)
+    if e.solution.reprojection_px > HIGH_REPROJECTION_PX:
         yield Finding(
             "residuals",
             "rejected" if e.refusal else "doubtful",
@@ -532,7 +532,7 @@ def diagnose_solution(e: Evidence) -> Iterator[Finding]:
         lengths = [f"the {device}'s by {100 * sigma:.1f} %" for device, sigma in uncertain.items()]
         yield Finding(
             "uncertain",
-            "doubtful" if is_misfit or max(uncertain.values()) < MAX_FOCAL_SIGMA else "rejected",
+            "rejected" if _is_focal_unknown(e) else "doubtful",
             f"the poses, whose tilts differ by {e.solution.tilt_spread_deg:.0f} degrees, leave"
             f" focal lengths uncertain: {' and '.join(lengths)}",
             "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
