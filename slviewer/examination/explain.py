@@ -56,7 +56,9 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
             own = patterns[places] - patterns[places].mean(axis=1, keepdims=True)
             squares = np.maximum(np.einsum("kp,kp->k", own, own), 1e-6)
             contrasts = np.einsum("kp,kp->k", own, seen[places].clip(-1, 2)) / squares
-            if not (np.abs(contrasts) < limits.UNRESOLVED).all():
+            # blur leaves grey, and no image of even light or darkness
+            uneven = np.abs(seen[places].mean(axis=1) - 0.5) > limits.FLAT
+            if (np.abs(contrasts) > limits.UNRESOLVED).any() or uneven.any():
                 break
             out += pair
     return out
@@ -298,16 +300,26 @@ def _measure_left(
 
 def _read_image(
     evaluator: Evaluator, hypothesis: Hypothesis, k: int
-) -> tuple[Indices, np.ndarray, np.ndarray] | None:
+) -> tuple[Indices, np.ndarray, np.ndarray, np.ndarray] | None:
     """Return what image k, which the hypothesis leaves out, shows at the pixels that the others
     explain: (p,) relative to their dark and bright levels; before it the frames of its axis, and
-    behind it their patterns (k, p). None for too few pixels."""
+    behind it their patterns (k, p), and the changes (2, p) of image and pattern k from neighbour to
+    neighbour, which are known even where two places fit. None for too few pixels."""
     for axis, sample, m, good in evaluator.explained(hypothesis):
         atoms = evaluator.atoms(hypothesis, axis)
         if k in atoms.frames:
-            shown = (sample.levels[k, 1][good] - m.background[good]) / m.contrast[good]
-            return tuple(atoms.frames), shown, atoms.at(m.coordinate[good])
+            levels, middle, half = sample.levels[k][:, good], m.coordinate[good], m.rise[good] / 2
+            shown = (levels[1] - m.background[good]) / m.contrast[good]
+            own = atoms.at(np.stack([middle - half, middle + half]).ravel())
+            first, second = own[atoms.frames.index(k)].reshape(2, -1)
+            steps = np.stack([(levels[2] - levels[0]) / m.contrast[good], second - first])
+            return tuple(atoms.frames), shown, atoms.at(middle), steps
     return None
+
+
+def _correlate(seen: np.ndarray, own: np.ndarray) -> float:
+    """Return the correlation of two series (p,), 0 where the second hardly varies."""
+    return float(np.corrcoef(seen, own)[0, 1]) if own.std() > 0.05 else 0.0
 
 
 def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> int | None:
@@ -315,7 +327,7 @@ def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> i
     out; None where it shows none."""
     if (read := _read_image(evaluator, hypothesis, k)) is None:
         return None
-    frames, shown, patterns = read
+    frames, shown, patterns, _ = read
     residual = np.minimum((shown - patterns) ** 2, 1).mean(axis=1)
     j = int(residual.argmin())
     is_like = residual[j] < limits.UNLIKE_ANY_LEAST and patterns[j].std() > limits.FLAT / 2
@@ -327,10 +339,10 @@ def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -
     the contrast; 0 where it shows its pattern, or what blur leaves of stripes, and no other one."""
     if (read := _read_image(evaluator, hypothesis, k)) is None:
         return 0.0
-    frames, shown, patterns = read
+    frames, shown, patterns, steps = read
     own = patterns[frames.index(k)]
-    is_flat = np.median(np.abs(shown - 0.5)) < limits.FLAT
-    alike = np.corrcoef(shown, own)[0, 1] if own.std() > 0.05 else 0.0
+    alike = max(_correlate(shown, own), _correlate(*steps))
+    is_flat = np.mean(np.minimum((shown - 0.5) ** 2, 1)) < limits.FLAT**2
     is_excused = hypothesis.sequence.frames[k].kind != "phase" and (is_flat or alike > limits.ALIKE)
     if is_excused and _identify_pattern(evaluator, hypothesis, k) is None:
         return 0.0

@@ -41,6 +41,9 @@ BEYOND_CODE = 2.2
 """The same of a Gray code, whose cells may be half as wide as described."""
 NEAR = 6
 """Steps of the table, a third of a period, within which two neighbours' coordinates join."""
+FREQUENT = 0.3
+"""Frequency of a distance between two neighbours' coordinates over the most frequent one's, from
+which it may be the right one: where two places fit, a wrong one is found twice as often at most."""
 UNDECIDED = 0.6
 """Share of one bit's variance that a pixel on the bit's edge leaves open: it is half bright."""
 CONTRASTS = (0.25, 1.5)
@@ -102,7 +105,7 @@ UNREADABLE, WEAK = 0.5, 16.0
 """Misfit that no hypothesis lowers, with which nothing can be measured; and range of levels in
 standard deviations of noise, below which noise is the reason."""
 FLAT, ALIKE = 0.175, 0.4
-"""Median distance from grey, and correlation with the pattern, of stripes that blur has closed."""
+"""Rms distance from grey, and correlation with the pattern, of stripes that blur has closed."""
 MISPLACED, MISPLACED_LEAST = 2.0, 0.003
 """Residual of a phase step over the median of its period, and squared contrast beyond it, from
 which other steps are tried: of 18 steps a neighbour's has 0.06."""
