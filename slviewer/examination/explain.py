@@ -185,7 +185,7 @@ def _least_sigmas(rated: _Rated, gained: float) -> float:
     in a possible direction, and the description, whose directions cost ``gained``, does not."""
     is_impossible = gained >= min(limits.MIRRORED_COST, limits.FOLDED_COST)
     is_possible = rated.turned < gained
-    return limits.SIGMAS_OF_IMPOSSIBLE if is_impossible and is_possible else limits.SIGMAS
+    return limits.SIGMAS_CONFIRMED if is_impossible and is_possible else limits.SIGMAS
 
 
 def _net(rated: _Rated) -> float:

@@ -119,7 +119,7 @@ def _judge_drift(
     constant = FrameLight.constant(count)
     gain = np.exp(rate * (np.arange(count) - count / 2))
     drift = replace(constant, gain=gain, terms=("gain",))
-    score = _score(evaluator, base, drift, first) if rate else np.inf
+    score = _score(evaluator, base, drift, first, limits.SIGMAS_CONFIRMED) if rate else np.inf
     return (drift, score) if np.isfinite(score) else (constant, 1.0)
 
 
@@ -178,11 +178,17 @@ def _accept(
     return replace(constant, unexplained=light.terms)
 
 
-def _score(evaluator: Evaluator, base: Hypothesis, light: FrameLight, first: np.ndarray) -> float:
+def _score(
+    evaluator: Evaluator,
+    base: Hypothesis,
+    light: FrameLight,
+    first: np.ndarray,
+    sigmas: float = limits.SIGMAS,
+) -> float:
     """Return the share of the residual, times that of the misfit, which a light leaves; infinite
     where pixels are few or match their neighbours less, or the improvement is not significant.
 
-    ``first`` (p,): losses under equal light.
+    ``first`` (p,): losses under equal light. ``sigmas``: standard errors of the improvement.
     """
     equal = equalize_samples(evaluator, base.sequence, light)
     losses = _measure_losses(evaluator, equal, base, light)
@@ -190,7 +196,7 @@ def _score(evaluator: Evaluator, base: Hypothesis, light: FrameLight, first: np.
     if len(gain) < limits.FEWEST_PIXELS / 2:
         return np.inf
     misfit = equal.compare(base, base).loss / evaluator.compare(base, base).loss
-    is_significant = gain.mean() > limits.SIGMAS * gain.std() / np.sqrt(len(gain))
+    is_significant = gain.mean() > sigmas * gain.std() / np.sqrt(len(gain))
     if misfit > limits.AS_WELL or not is_significant:
         return np.inf
     return float(losses[both].mean() / first[both].mean() * misfit)

@@ -68,8 +68,9 @@ SIGMAS = 5.0
 MOST_SKEWED = 1.5
 """Factor by which the error of a gain that only a part of the pixels show is smaller than by their
 deviation: a dozen pixels are needed for it to be significant."""
-SIGMAS_OF_IMPOSSIBLE = 3.0
-"""The same where it explains coordinates that run in an impossible direction as well."""
+SIGMAS_CONFIRMED = 3.0
+"""The same of one hypothesis that other evidence asks for, one in 700 by chance: coordinates that
+run in an impossible direction, and frames' means that drift."""
 EXPLAINED = 0.25
 """Share of the misfit that it must explain, or ..."""
 LEFT_OF_FRAMES = 0.6
