@@ -193,11 +193,13 @@ def _judge_light(
     """Yield the findings of light that varies, and of a projector response that is not linear."""
     yield from describe_light(sequence, light)
     for axis in sequence.axes:
-        if not 0 < min((len(s) for _, s in sequence.phase_shifts(axis)), default=0) <= MOST_STEPS:
+        if not any(len(steps) <= MOST_STEPS for _, steps in sequence.phase_shifts(axis)):
             continue
         try:
             task = prepare_decoding(sequence, stack, axis, light)
         except InputError:  # decoding reports it, with the remedy
             continue
-        harmonics = estimate_aliased_harmonics(task.layout, task.stack, task.white, task.noise)
-        yield from describe_gamma(harmonics, task.layout)
+        few = [shift for shift in task.layout.shifts if len(shift.indices) <= MOST_STEPS]
+        layout = replace(task.layout, shifts=(few[-1],))
+        harmonics = estimate_aliased_harmonics(layout, task.stack, task.white, task.noise)
+        yield from describe_gamma(harmonics, layout, task.layout.period_px)
