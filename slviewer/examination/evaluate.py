@@ -141,7 +141,8 @@ class Evaluator:
         chance = np.sqrt(2 * np.mean(np.minimum(gain, 0) ** 2))
         error = max(float(chance), float(gain.std()) / limits.MOST_SKEWED) / np.sqrt(len(gain))
         every = np.concatenate(losses)
-        return MisfitChange(float(every.mean()) if every.size else 1.0, mean, mean / (error + 1e-9))
+        sigmas, share = mean / (error + 1e-9), np.mean(gain > 0) / max(np.mean(gain != 0), 1e-9)
+        return MisfitChange(float(every.mean()) if every.size else 1.0, mean, sigmas, float(share))
 
     def residuals(self, hypothesis: Hypothesis) -> np.ndarray:
         """Return the mean squared residual (n,) of each image in squares of the pattern's contrast,
@@ -191,12 +192,14 @@ class MisfitChange:
     """By how much a hypothesis explains the images better than another.
 
     ``loss``: mean share of the images' variance that the other leaves; ``gain``: by how much less
-    the first leaves; ``sigmas``: the gain in standard errors.
+    the first leaves; ``sigmas``: the gain in standard errors; ``share``: of the pixels that it
+    changes, those that it explains better.
     """
 
     loss: float
     gain: float
     sigmas: float
+    share: float
 
     @property
     def left(self) -> float:

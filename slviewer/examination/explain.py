@@ -93,6 +93,8 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
         for r in sorted(_rate_all(evaluator, base), key=_net, reverse=True)
         if r.comparison.sigmas > _least_sigmas(r, gained)
         and r.net + gained > 0
+        # a strange image misleads everywhere; edges of surfaces and beats are misread in lines
+        and (r.hypotheses[0].excluded is None or r.comparison.share > limits.MAJORITY)
         and (r.hypotheses[0].axis or not unresolved.issuperset(r.hypotheses[0].changed))
     ]
     if not rated:
@@ -197,7 +199,8 @@ def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _R
     """Compare hypotheses of different axes with the description, on all pixels."""
     each = [evaluator.compare(base, h) for h in hypotheses]
     gain = sum(c.gain for c in each)
-    comparison = MisfitChange(each[0].loss, gain, min(c.sigmas for c in each))
+    sigmas, share = min(c.sigmas for c in each), min(c.share for c in each)
+    comparison = MisfitChange(each[0].loss, gain, sigmas, share)
     turned = _turned(evaluator, hypotheses)
     net = gain - sum(h.cost for h in hypotheses) - turned
     return _Rated(hypotheses, comparison, net, turned)
