@@ -174,6 +174,19 @@ class Evaluator:
             slopes.append(fit[:0:-1])
         return np.array(slopes) if len(slopes) == 2 else None
 
+    def list_beyond(self, hypotheses: Sequence[Hypothesis]) -> dict[Axis, np.ndarray]:
+        """Return the coordinates px of each axis of which too many lie beyond the projector, under
+        the hypotheses."""
+        out: dict[Axis, np.ndarray] = {}
+        for axis in self.sample.by_axis:
+            own = _select_own(hypotheses, axis)
+            sequence, m = own.sequence, self.match(own, axis)
+            if m is not None and sequence.projector_size:
+                u, limit = m.coordinate[m.misfit < limits.GOOD], sequence.extent(axis) + 0.5
+                if np.sum(u > limit) > limits.OUTSIDE[bool(sequence.find("gray", axis))] * u.size:
+                    out[axis] = u
+        return out
+
     def list_folded(self, hypotheses: Sequence[Hypothesis], jacobian: np.ndarray) -> list[Axis]:
         """Return the axes whose coordinates fall from neighbour to neighbour where they rise over
         the image, or the other way round, under the hypotheses, of which `jacobian` is known."""

@@ -66,10 +66,10 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
 
 def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
     """Return whether the description leaves more than noise, in all images or in one, or gives
-    coordinates that fall from neighbour to neighbour where they rise over the image: aliases, which
-    fit as well where the patterns have few levels."""
+    coordinates beyond the projector, or that fall from neighbour to neighbour where they rise over
+    the image: aliases, which fit as well where the patterns have few levels."""
     J = evaluator.jacobian((base,))
-    if J is not None and evaluator.list_folded((base,), J):
+    if evaluator.list_beyond((base,)) or (J is not None and evaluator.list_folded((base,), J)):
         return True
     residuals = evaluator.residuals(base)
     for axis in evaluator.sample.by_axis:
@@ -207,16 +207,17 @@ def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _R
 
 
 def _turned(evaluator: Evaluator, hypotheses: Explanation) -> float:
-    """Return the cost of the directions in which the coordinates rise: the same from neighbour to
-    neighbour and over the image; camera and projector both see the scene from the front, and mostly
-    stand upright."""
+    """Return the cost of coordinates beyond the projector, and of the directions in which they
+    rise: the same from neighbour to neighbour and over the image; camera and projector both see the
+    scene from the front, and mostly stand upright."""
     J = evaluator.jacobian(hypotheses)
+    cost = limits.FOLDED_COST * len(evaluator.list_beyond(hypotheses))
     if J is None:
-        return 0.0
-    folded = limits.FOLDED_COST * len(evaluator.list_folded(hypotheses, J))
+        return cost
+    cost += limits.FOLDED_COST * len(evaluator.list_folded(hypotheses, J))
     if np.linalg.det(J) < 0:
-        return folded + limits.MIRRORED_COST
-    return folded + (limits.TURNED_COST if J[0, 0] < 0 and J[1, 1] < 0 else 0.0)
+        return cost + limits.MIRRORED_COST
+    return cost + (limits.TURNED_COST if J[0, 0] < 0 and J[1, 1] < 0 else 0.0)
 
 
 def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained: float) -> bool:

@@ -126,9 +126,9 @@ LOST_COST = 1e-3
 MIRRORED_COST, TURNED_COST, FOLDED_COST = 0.02, 0.002, 0.02
 """The same for coordinates that are a mirror image of what the camera sees, which no device shows;
 for a projector upside down, which is rare; and for an axis that runs backwards from neighbour to
-neighbour."""
+neighbour, or beyond the projector."""
 
-OUTSIDE, OUTSIDE_OF_CODE = 0.08, 0.02
+OUTSIDE = 0.08, 0.02
 """Share of the coordinates beyond the projector, that noise of fine periods does not reach, and
 that wrong bits of a Gray code do not."""
 FEWEST_AT_EDGES = 15
