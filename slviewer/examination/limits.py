@@ -123,10 +123,10 @@ PER_FRAME_COST, CHANGE_COST = 1e-4, 1e-3
 equal explanations the simplest is chosen."""
 LOST_COST = 1e-3
 """The same for a missing image, which may be any."""
-MIRRORED_COST, TURNED_COST, FOLDED_COST = 0.02, 0.002, 0.02
-"""The same for coordinates that are a mirror image of what the camera sees, which no device shows;
-for a projector upside down, which is rare; and for an axis that runs backwards from neighbour to
-neighbour, or beyond the projector."""
+IMPOSSIBLE_COST, TURNED_COST = 0.02, 0.002
+"""The same for each axis that runs beyond the projector, or backwards from neighbour to neighbour,
+and for a mirror image of what the camera sees, which no device shows; and for a projector upside
+down, which is rare."""
 
 OUTSIDE = 0.08, 0.02
 """Share of the coordinates beyond the projector, that noise of fine periods does not reach, and
@@ -207,10 +207,3 @@ UNKNOWN_GAIN = 0.1
 it."""
 SCATTERED = 0.03
 """Light that the scene scatters into dark stripes, of the contrast."""
-FUZZY = 0.4
-"""Share of the pixels at a stripe's edge, from which blur may have changed its contrast."""
-FUZZY_WEIGHT = 0.2
-"""Weight of their levels: blur changes them by up to a third of the contrast."""
-CONTRAST_PRIORS = 0.1, 0.5
-"""Uncertainty of the contrast of a frame's stripes: wide ones scatter light, and blur takes all of
-it from fine ones."""
