@@ -153,7 +153,9 @@ def _fit_groups(
     return out
 
 
-def _regress(x: np.ndarray, y: np.ndarray, least: float, most: float) -> np.float32:
+def _regress(
+    x: np.ndarray, y: np.ndarray, least: float | np.float32, most: float | np.float32
+) -> np.float32:
     """Return the slope of ``y`` over ``x``, within limits."""
     x0 = x - x.mean()
     return np.float32(np.clip(np.mean(x0 * (y - y.mean())) / max(x0.var(), 1e-3), least, most))
