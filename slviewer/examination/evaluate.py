@@ -136,9 +136,6 @@ class Evaluator:
             if a is None or b is None:
                 gains.append(np.zeros(len(sample.swing)))
                 losses.append(np.zeros(0) if a is None else a.misfit)
-            elif len(a.images) == len(b.images):
-                gains.append(a.misfit - b.misfit)
-                losses.append(a.misfit)
             else:
                 common = [i for i in a.images if i in b.images]
                 total = np.maximum(sample.levels[common, 1].var(axis=0) * len(common), 1e-6)
@@ -154,7 +151,8 @@ class Evaluator:
         chance = np.sqrt(2 * np.mean(np.minimum(gain, 0) ** 2))
         error = max(float(chance), float(gain.std()) / limits.MOST_SKEWED) / np.sqrt(len(gain))
         every = np.concatenate(losses)
-        return MisfitChange(float(every.mean()) if every.size else 1.0, mean, mean / (error + 1e-9))
+        sigmas, share = mean / (error + 1e-9), np.mean(gain > 0) / max(np.mean(gain != 0), 1e-9)
+        return MisfitChange(float(every.mean()) if every.size else 1.0, mean, sigmas, float(share))
 
     def residuals(self, hypothesis: Hypothesis) -> np.ndarray:
         """Return the mean squared residual (n,) of each image in squares of the pattern's contrast,
@@ -186,6 +184,19 @@ class Evaluator:
             slopes.append(fit[:0:-1])
         return np.array(slopes) if len(slopes) == 2 else None
 
+    def list_beyond(self, hypotheses: Sequence[Hypothesis]) -> dict[Axis, np.ndarray]:
+        """Return the coordinates px of each axis of which too many lie beyond the projector, under
+        the hypotheses."""
+        out: dict[Axis, np.ndarray] = {}
+        for axis in self.sample.by_axis:
+            own = _select_own(hypotheses, axis)
+            sequence, m = own.sequence, self.match(own, axis)
+            if m is not None and sequence.projector_size:
+                u, limit = m.coordinate[m.misfit < limits.GOOD], sequence.extent(axis) + 0.5
+                if np.sum(u > limit) > limits.OUTSIDE[bool(sequence.find("gray", axis))] * u.size:
+                    out[axis] = u
+        return out
+
     def list_folded(self, hypotheses: Sequence[Hypothesis], jacobian: np.ndarray) -> list[Axis]:
         """Return the axes whose coordinates fall from neighbour to neighbour where they rise over
         the image, or the other way round, under the hypotheses, of which `jacobian` is known."""
@@ -204,12 +215,14 @@ class MisfitChange:
     """By how much a hypothesis explains the images better than another.
 
     ``loss``: mean share of the images' variance that the other leaves; ``gain``: by how much less
-    the first leaves; ``sigmas``: the gain in standard errors.
+    the first leaves; ``sigmas``: the gain in standard errors; ``share``: of the pixels that it
+    changes, those that it explains better.
     """
 
     loss: float
     gain: float
     sigmas: float
+    share: float
 
     @property
     def left(self) -> float:

@@ -61,10 +61,11 @@ def _judge(
         return [describe_missing_pattern(sample)]
     ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
     found, coordinates = explain(evaluator, base), [*_judge_coordinates(evaluator, base)]
-    if coordinates and _is_motion(found):  # codes that cannot be are displaced as well
-        found = ()
-    if found and not _is_imitated(found, evaluator, bool(ghost), bool(motion)):
-        return _describe_explanation(found, evaluator, base)
+    named = _describe_explanation(found, evaluator, base)
+    if coordinates and any(each.cause == "moved" for each in named):
+        named = []  # codes that cannot be are displaced as well
+    if named and not _is_imitated(found, evaluator, bool(ghost), bool(motion)):
+        return named
     if motion and not ghost and not coordinates:
         return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
     judged = [*_judge_readability(evaluator, base), *coordinates]
@@ -97,15 +98,10 @@ def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evalu
     return evaluator if rivals and max(rivals) < equal.compare(base, base).loss else equal
 
 
-def _is_motion(found: Explanation) -> bool:
-    """Return whether an explanation is a motion."""
-    return bool(found) and found[0].cause == "moved"
-
-
 def _is_like_ghost(found: Explanation) -> bool:
     """Return whether ghosts imitate an explanation: motion, beside which they are measured, and one
     strange frame, as the first image, which has none before it, stands out."""
-    return _is_motion(found) or [each.cause for each in found] == ["duplicate-frame"]
+    return [each.cause for each in found] in (["moved"], ["duplicate-frame"])
 
 
 def _are_displaced(evaluator: Evaluator, found: Explanation) -> bool:
@@ -128,6 +124,8 @@ def _describe_explanation(
     An offset of the phase that is no convention, on one axis of several periods captured one after
     the other, is motion between them.
     """
+    if not found:
+        return []
     sequence, first, axis = base.sequence, found[0], found[0].axis
     if first.cause == "moved" and axis is not None and first.value is not None:
         return [describe_motion(sequence, axis, first.value)]
@@ -166,6 +164,7 @@ def _judge_coordinates(evaluator: Evaluator, base: Hypothesis) -> Iterator[Findi
     jacobian = evaluator.jacobian((base,))
     mirrored = [] if jacobian is None else [*describe_mirroring(sequence, jacobian)]
     yield from mirrored
+    beyond = evaluator.list_beyond((base,))
     for axis in sequence.axes if sequence.projector_size and not mirrored else ():
         try:
             layout = axis_layout(sequence, axis)
@@ -176,14 +175,8 @@ def _judge_coordinates(evaluator: Evaluator, base: Hypothesis) -> Iterator[Findi
             remedy = remedy or REMEDIES["projector-size"]
             yield Finding("projector-size", "rejected", text, remedy, (), (), axis)
             continue
-        m = evaluator.match(base, axis)
-        if m is None:
-            continue
-        u, extent = m.coordinate[m.misfit < limits.GOOD], sequence.extent(axis)
-        share = float(np.mean(u > extent + 0.5)) if u.size else 0.0
-        is_coded = bool(sequence.find("gray", axis))
-        if share > (limits.OUTSIDE_OF_CODE if is_coded else limits.OUTSIDE):
-            yield describe_reach(axis, extent, u, share)
+        if axis in beyond:
+            yield describe_reach(axis, sequence.extent(axis), beyond[axis])
 
 
 def _judge_light(
@@ -192,11 +185,13 @@ def _judge_light(
     """Yield the findings of light that varies, and of a projector response that is not linear."""
     yield from describe_light(sequence, light)
     for axis in sequence.axes:
-        if not 0 < min((len(s) for _, s in sequence.phase_shifts(axis)), default=0) <= MOST_STEPS:
+        if not any(len(steps) <= MOST_STEPS for _, steps in sequence.phase_shifts(axis)):
             continue
         try:
             task = prepare_decoding(sequence, stack, axis, light)
         except InputError:  # decoding reports it, with the remedy
             continue
-        harmonics = estimate_aliased_harmonics(task.layout, task.stack, task.white, task.noise)
-        yield from describe_gamma(harmonics, task.layout)
+        few = [shift for shift in task.layout.shifts if len(shift.indices) <= MOST_STEPS]
+        layout = replace(task.layout, shifts=(few[-1],))
+        harmonics = estimate_aliased_harmonics(layout, task.stack, task.white, task.noise)
+        yield from describe_gamma(harmonics, layout, task.layout.period_px)

@@ -56,7 +56,9 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
             own = patterns[places] - patterns[places].mean(axis=1, keepdims=True)
             squares = np.maximum(np.einsum("kp,kp->k", own, own), 1e-6)
             contrasts = np.einsum("kp,kp->k", own, seen[places].clip(-1, 2)) / squares
-            if not (np.abs(contrasts) < limits.UNRESOLVED).all():
+            # blur leaves grey, and no image of even light or darkness
+            uneven = np.abs(seen[places].mean(axis=1) - 0.5) > limits.FLAT
+            if (np.abs(contrasts) > limits.UNRESOLVED).any() or uneven.any():
                 break
             out += pair
     return out
@@ -64,10 +66,10 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
 
 def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
     """Return whether the description leaves more than noise, in all images or in one, or gives
-    coordinates that fall from neighbour to neighbour where they rise over the image: aliases, which
-    fit as well where the patterns have few levels."""
+    coordinates beyond the projector, or that fall from neighbour to neighbour where they rise over
+    the image: aliases, which fit as well where the patterns have few levels."""
     J = evaluator.jacobian((base,))
-    if J is not None and evaluator.list_folded((base,), J):
+    if evaluator.list_beyond((base,)) or (J is not None and evaluator.list_folded((base,), J)):
         return True
     residuals = evaluator.residuals(base)
     for axis in evaluator.sample.by_axis:
@@ -91,6 +93,8 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
         for r in sorted(_rate_all(evaluator, base), key=_net, reverse=True)
         if r.comparison.sigmas > _least_sigmas(r, gained)
         and r.net + gained > 0
+        # a strange image misleads everywhere; edges of surfaces and beats are misread in lines
+        and (r.hypotheses[0].excluded is None or r.comparison.share > limits.MAJORITY)
         and (r.hypotheses[0].axis or not unresolved.issuperset(r.hypotheses[0].changed))
     ]
     if not rated:
@@ -181,9 +185,8 @@ class _Rated:
 def _least_sigmas(rated: _Rated, gained: float) -> float:
     """Return the significance that an explanation needs: less where it gives coordinates that rise
     in a possible direction, and the description, whose directions cost ``gained``, does not."""
-    is_impossible = gained >= min(limits.MIRRORED_COST, limits.FOLDED_COST)
-    is_possible = rated.turned < gained
-    return limits.SIGMAS_OF_IMPOSSIBLE if is_impossible and is_possible else limits.SIGMAS
+    is_confirmed = gained - rated.turned > limits.IMPOSSIBLE_COST / 2
+    return limits.SIGMAS_CONFIRMED if is_confirmed else limits.SIGMAS
 
 
 def _net(rated: _Rated) -> float:
@@ -195,23 +198,23 @@ def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _R
     """Compare hypotheses of different axes with the description, on all pixels."""
     each = [evaluator.compare(base, h) for h in hypotheses]
     gain = sum(c.gain for c in each)
-    comparison = MisfitChange(each[0].loss, gain, min(c.sigmas for c in each))
+    sigmas, share = min(c.sigmas for c in each), min(c.share for c in each)
+    comparison = MisfitChange(each[0].loss, gain, sigmas, share)
     turned = _turned(evaluator, hypotheses)
     net = gain - sum(h.cost for h in hypotheses) - turned
     return _Rated(hypotheses, comparison, net, turned)
 
 
 def _turned(evaluator: Evaluator, hypotheses: Explanation) -> float:
-    """Return the cost of the directions in which the coordinates rise: the same from neighbour to
-    neighbour and over the image; camera and projector both see the scene from the front, and mostly
-    stand upright."""
+    """Return the cost of coordinates beyond the projector, and of the directions in which they
+    rise: the same from neighbour to neighbour and over the image; camera and projector both see the
+    scene from the front, and mostly stand upright."""
     J = evaluator.jacobian(hypotheses)
-    if J is None:
-        return 0.0
-    folded = limits.FOLDED_COST * len(evaluator.list_folded(hypotheses, J))
-    if np.linalg.det(J) < 0:
-        return folded + limits.MIRRORED_COST
-    return folded + (limits.TURNED_COST if J[0, 0] < 0 and J[1, 1] < 0 else 0.0)
+    impossible, is_turned = len(evaluator.list_beyond(hypotheses)), False
+    if J is not None:
+        impossible += len(evaluator.list_folded(hypotheses, J)) + bool(np.linalg.det(J) < 0)
+        is_turned = J[0, 0] < 0 and J[1, 1] < 0
+    return limits.IMPOSSIBLE_COST * impossible + limits.TURNED_COST * is_turned
 
 
 def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained: float) -> bool:
@@ -298,16 +301,26 @@ def _measure_left(
 
 def _read_image(
     evaluator: Evaluator, hypothesis: Hypothesis, k: int
-) -> tuple[Indices, np.ndarray, np.ndarray] | None:
+) -> tuple[Indices, np.ndarray, np.ndarray, np.ndarray] | None:
     """Return what image k, which the hypothesis leaves out, shows at the pixels that the others
     explain: (p,) relative to their dark and bright levels; before it the frames of its axis, and
-    behind it their patterns (k, p). None for too few pixels."""
+    behind it their patterns (k, p), and the changes (2, p) of image and pattern k from neighbour to
+    neighbour, which are known even where two places fit. None for too few pixels."""
     for axis, sample, m, good in evaluator.explained(hypothesis):
         atoms = evaluator.atoms(hypothesis, axis)
         if k in atoms.frames:
-            shown = (sample.levels[k, 1][good] - m.background[good]) / m.contrast[good]
-            return tuple(atoms.frames), shown, atoms.at(m.coordinate[good])
+            levels, middle, half = sample.levels[k][:, good], m.coordinate[good], m.rise[good] / 2
+            shown = (levels[1] - m.background[good]) / m.contrast[good]
+            own = atoms.at(np.stack([middle - half, middle + half]).ravel())
+            first, second = own[atoms.frames.index(k)].reshape(2, -1)
+            steps = np.stack([(levels[2] - levels[0]) / m.contrast[good], second - first])
+            return tuple(atoms.frames), shown, atoms.at(middle), steps
     return None
+
+
+def _correlate(seen: np.ndarray, own: np.ndarray) -> float:
+    """Return the correlation of two series (p,), 0 where the second hardly varies."""
+    return float(np.corrcoef(seen, own)[0, 1]) if own.std() > 0.05 else 0.0
 
 
 def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> int | None:
@@ -315,7 +328,7 @@ def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> i
     out; None where it shows none."""
     if (read := _read_image(evaluator, hypothesis, k)) is None:
         return None
-    frames, shown, patterns = read
+    frames, shown, patterns, _ = read
     residual = np.minimum((shown - patterns) ** 2, 1).mean(axis=1)
     j = int(residual.argmin())
     is_like = residual[j] < limits.UNLIKE_ANY_LEAST and patterns[j].std() > limits.FLAT / 2
@@ -327,10 +340,10 @@ def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -
     the contrast; 0 where it shows its pattern, or what blur leaves of stripes, and no other one."""
     if (read := _read_image(evaluator, hypothesis, k)) is None:
         return 0.0
-    frames, shown, patterns = read
+    frames, shown, patterns, steps = read
     own = patterns[frames.index(k)]
-    is_flat = np.median(np.abs(shown - 0.5)) < limits.FLAT
-    alike = np.corrcoef(shown, own)[0, 1] if own.std() > 0.05 else 0.0
+    alike = max(_correlate(shown, own), _correlate(*steps))
+    is_flat = np.mean(np.minimum((shown - 0.5) ** 2, 1)) < limits.FLAT**2
     is_excused = hypothesis.sequence.frames[k].kind != "phase" and (is_flat or alike > limits.ALIKE)
     if is_excused and _identify_pattern(evaluator, hypothesis, k) is None:
         return 0.0

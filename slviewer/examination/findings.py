@@ -303,9 +303,9 @@ def mirroring_remedy(of_projector: str) -> str:
     )
 
 
-def describe_reach(axis: Axis, extent: int, coordinate: np.ndarray, share: float) -> Finding:
-    """Return the finding of coordinates (p,) px of which a ``share`` lies beyond the projector."""
-    reach = float(np.quantile(coordinate, 0.995))
+def describe_reach(axis: Axis, extent: int, coordinate: np.ndarray) -> Finding:
+    """Return the finding of coordinates (p,) px of which many lie beyond the projector."""
+    reach, share = float(np.quantile(coordinate, 0.995)), np.mean(coordinate > extent + 0.5)
     text = (
         f"{100 * share:.0f} % of the {axis} codes lie outside the projector's {extent}"
         f" {LINES[axis]} and reach {reach:.0f}"
@@ -424,8 +424,11 @@ def describe_disturbance(terms: Sequence[Term]) -> Finding:
     return Finding(cause, "rejected", f"{text} by more than can be corrected", REMEDIES[cause])
 
 
-def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> Iterator[Finding]:
-    """Yield the finding of a significant ripple of the phase by the projector's response."""
+def describe_gamma(
+    harmonics: AliasedHarmonics, layout: Layout, finest_px: float
+) -> Iterator[Finding]:
+    """Yield the finding of a significant ripple of the phase by the projector's response; a note
+    where the finest period, which alone shifts the coordinates, has more steps."""
     if not harmonics.is_significant:
         return
     per_rad = layout.period_px / (2 * np.pi)
@@ -436,10 +439,13 @@ def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> Iterator[Find
         if harmonics.is_corrected
         else "it could not be measured well enough to correct it"
     )
+    outcome += f", and {harmonics.error_rad * per_rad:.2g} px was added to the uncertainty"
+    severity: Severity = "doubtful"
+    if layout.period_px > finest_px:
+        outcome, severity = "the finest period has more steps, and is shifted less", "note"
     text = (
         f"the projector response is nonlinear (gamma): with {harmonics.steps} phase steps this"
-        f" shifts the coordinates of axis {layout.axis} by up to {largest:.2g} px ({outcome}, and"
-        f" {harmonics.error_rad * per_rad:.2g} px was added to the uncertainty)"
+        f" shifts the coordinates of axis {layout.axis} by up to {largest:.2g} px ({outcome})"
     )
     frames = layout.shifts[-1].indices[:1]
-    yield Finding("gamma", "doubtful", text, REMEDIES["gamma"], (), frames, layout.axis)
+    yield Finding("gamma", severity, text, REMEDIES["gamma"], (), frames, layout.axis)

@@ -38,8 +38,7 @@ def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
     )
     for k in range(1, n):
         shifted = _lag_from(sequence, k), _miss(sequence, k)
-        # of one frame alone, the image after it is not that of another pattern
-        yield from (hypothesis for hypothesis in shifted if len(hypothesis.changed) > 1)
+        yield from (hypothesis for hypothesis in shifted if _moves_several(hypothesis))
     yield from _exchange_axes(sequence)
     for k in range(n):
         images = [None if i == k else i for i in range(n)]
@@ -90,7 +89,7 @@ def list_neighbours(hypothesis: Hypothesis) -> Iterator[Hypothesis]:
         first = hypothesis.frames[0]
         for k in range(max(1, first - 3), min(len(hypothesis.images), first + 4)):
             neighbour = shift(hypothesis.sequence, k)
-            if len(neighbour.changed) > 1:
+            if _moves_several(neighbour):
                 yield neighbour
 
 
@@ -143,6 +142,12 @@ def _miss(sequence: PatternSequence, k: int) -> Hypothesis:
     """Return the hypothesis that the image of frame k is missing, and later ones are early."""
     every = range(len(sequence.frames))
     return _order("missing-frame", sequence, [*every[:k], None, *every[k:-1]], (k,))
+
+
+def _moves_several(hypothesis: Hypothesis) -> bool:
+    """Return whether several images show other patterns: of one alone, the next image need not be
+    that of another pattern."""
+    return sum(hypothesis.images[i] is not None for i in hypothesis.changed) > 1
 
 
 def _reorder(sequence: PatternSequence, orders: Mapping[Indices, Sequence[int]]) -> Hypothesis:

@@ -41,6 +41,9 @@ BEYOND_CODE = 2.2
 """The same of a Gray code, whose cells may be half as wide as described."""
 NEAR = 6
 """Steps of the table, a third of a period, within which two neighbours' coordinates join."""
+FREQUENT = 0.3
+"""Frequency of a distance between two neighbours' coordinates over the most frequent one's, from
+which it may be the right one: where two places fit, a wrong one is found twice as often at most."""
 UNDECIDED = 0.6
 """Share of one bit's variance that a pixel on the bit's edge leaves open: it is half bright."""
 CONTRASTS = (0.25, 1.5)
@@ -65,8 +68,12 @@ SIGMAS = 5.0
 MOST_SKEWED = 1.5
 """Factor by which the error of a gain that only a part of the pixels show is smaller than by their
 deviation: a dozen pixels are needed for it to be significant."""
-SIGMAS_OF_IMPOSSIBLE = 3.0
-"""The same where it explains coordinates that run in an impossible direction as well."""
+MAJORITY = 0.5
+"""Share of the pixels that an image which shows something else must mislead; measured, it misleads
+from 0.58, and edges of surfaces and of beats leave 0.43."""
+SIGMAS_CONFIRMED = 3.0
+"""The same of one hypothesis that other evidence asks for, one in 700 by chance: coordinates that
+run in an impossible direction, and frames' means that drift."""
 EXPLAINED = 0.25
 """Share of the misfit that it must explain, or ..."""
 LEFT_OF_FRAMES = 0.6
@@ -102,7 +109,7 @@ UNREADABLE, WEAK = 0.5, 16.0
 """Misfit that no hypothesis lowers, with which nothing can be measured; and range of levels in
 standard deviations of noise, below which noise is the reason."""
 FLAT, ALIKE = 0.175, 0.4
-"""Median distance from grey, and correlation with the pattern, of stripes that blur has closed."""
+"""Rms distance from grey, and correlation with the pattern, of stripes that blur has closed."""
 MISPLACED, MISPLACED_LEAST = 2.0, 0.003
 """Residual of a phase step over the median of its period, and squared contrast beyond it, from
 which other steps are tried: of 18 steps a neighbour's has 0.06."""
@@ -116,12 +123,12 @@ PER_FRAME_COST, CHANGE_COST = 1e-4, 1e-3
 equal explanations the simplest is chosen."""
 LOST_COST = 1e-3
 """The same for a missing image, which may be any."""
-MIRRORED_COST, TURNED_COST, FOLDED_COST = 0.02, 0.002, 0.02
-"""The same for coordinates that are a mirror image of what the camera sees, which no device shows;
-for a projector upside down, which is rare; and for an axis that runs backwards from neighbour to
-neighbour."""
+IMPOSSIBLE_COST, TURNED_COST = 0.02, 0.002
+"""The same for each axis that runs beyond the projector, or backwards from neighbour to neighbour,
+and for a mirror image of what the camera sees, which no device shows; and for a projector upside
+down, which is rare."""
 
-OUTSIDE, OUTSIDE_OF_CODE = 0.08, 0.02
+OUTSIDE = 0.08, 0.02
 """Share of the coordinates beyond the projector, that noise of fine periods does not reach, and
 that wrong bits of a Gray code do not."""
 FEWEST_AT_EDGES = 15
@@ -200,10 +207,3 @@ UNKNOWN_GAIN = 0.1
 it."""
 SCATTERED = 0.03
 """Light that the scene scatters into dark stripes, of the contrast."""
-FUZZY = 0.4
-"""Share of the pixels at a stripe's edge, from which blur may have changed its contrast."""
-FUZZY_WEIGHT = 0.2
-"""Weight of their levels: blur changes them by up to a third of the contrast."""
-CONTRAST_PRIORS = 0.1, 0.5
-"""Uncertainty of the contrast of a frame's stripes: wide ones scatter light, and blur takes all of
-it from fine ones."""

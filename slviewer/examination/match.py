@@ -8,6 +8,7 @@ two neighbours: that counts wrong patterns, and patterns that do not join, alike
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from slviewer.examination import limits
@@ -137,51 +138,71 @@ def _fit_groups(
     stripes = groups < 0
     x, y = predicted[stripes][:, good], relative[stripes]
     if x.size and x.var() > limits.VARIED_STRIPES:  # they are what fringes are compared with
-        slope = np.mean((x - x.mean()) * (y - y.mean())) / x.var()
-        slope = np.float32(np.clip(slope, 1 / limits.CONTRASTS[1], limits.CONTRASTS[1]))
+        slope = _regress(x, y, 1 / limits.CONTRASTS[1], limits.CONTRASTS[1])
         relative = (relative - y.mean()) / slope + x.mean()
     for group in range(groups.max() + 1):
         own = groups == group
         if np.count_nonzero(own) < 3:
             continue
         x, y = predicted[own][:, good].ravel(), relative[own].ravel()
-        middle, spread = x.mean(), np.float32(max(float(x.var()), 1e-3))
-        slope = np.mean((x - middle) * (y - y.mean())) / spread
-        slope = np.float32(np.clip(slope, *limits.CONTRASTS))
-        bent = (x - middle) ** 2 - spread
-        curve = np.mean(bent * (y - slope * (x - middle))) / max(float(bent.var()), 1e-3)
-        curve = np.float32(np.clip(curve, -slope / 2, slope / 2))
+        slope, middle = _regress(x, y, *limits.CONTRASTS), x.mean()
+        spread = np.mean((x - middle) ** 2)
+        curve = _regress((x - middle) ** 2, y - slope * x, -slope / 2, slope / 2)
         z = predicted[own] - middle
         out[own] = y.mean() + slope * z + curve * (z**2 - spread)
     return out
 
 
-def _join(scores: np.ndarray, length: np.ndarray, undecided: float) -> np.ndarray:
-    """Return the place (2, p) of the best score of two neighbours; where one is undecided, the
-    place that is near the other's.
+def _regress(
+    x: np.ndarray, y: np.ndarray, least: float | np.float32, most: float | np.float32
+) -> np.float32:
+    """Return the slope of ``y`` over ``x``, within limits."""
+    x0 = x - x.mean()
+    return np.float32(np.clip(np.mean(x0 * (y - y.mean())) / max(x0.var(), 1e-3), least, most))
 
-    ``scores`` (2, p, u); ``length`` (2, p) of the pixels' centred levels.
+
+def _join(scores: np.ndarray, length: np.ndarray, undecided: float) -> np.ndarray:
+    """Return the place (2, p) of the best score of two neighbours; of places that are not at the
+    usual distance, those at about that distance which fit both best, where the pixels decide too
+    little against them.
+
+    ``scores`` (2, p, u); ``length`` (2, p) of the pixels' centred levels. Where several places fit
+    equally well several distances are frequent, and the usual one is that which fits best.
     """
     best = scores.argmax(axis=2)
-    highest = np.take_along_axis(scores, best[:, :, None], axis=2)[:, :, 0]
-    usual = int(np.median(best[1] - best[0]))
-    far = np.flatnonzero(np.abs(best[1] - best[0] - usual) > limits.NEAR)
-    if not far.size:
-        return best
-    window = np.arange(-limits.NEAR, limits.NEAR + 1)
-    rival, loss = np.empty((2, len(far)), int), np.empty((2, len(far)))
-    for i in (0, 1):
-        around = best[1 - i][far][:, None] + (usual if i else -usual) + window
-        around = np.clip(around, 0, scores.shape[2] - 1)
-        near = np.take_along_axis(scores[i][far], around, axis=1)
-        k = near.argmax(axis=1)
-        rows = np.arange(len(far))
-        rival[i] = around[rows, k]
-        loss[i] = (highest[i][far] - near[rows, k]) / np.maximum(length[i][far], 1e-6)
-    least = loss.argmin(axis=0)
-    accepted = np.flatnonzero(loss.min(axis=0) < undecided)
-    best[least[accepted], far[accepted]] = rival[least[accepted], accepted]
-    return best
+    rise = best[1] - best[0]
+    window = np.hanning(2 * limits.NEAR + 3)
+    counts = np.convolve(np.bincount(rise - rise.min()), window)[limits.NEAR + 1 :]
+    joined, least, most = best, np.inf, counts.max()
+    while counts.max() > limits.FREQUENT * most:
+        k = int(counts.argmax())
+        counts[max(k - limits.NEAR, 0) : k + limits.NEAR + 1] = 0
+        usual = k + int(rise.min())
+        far = np.flatnonzero(np.abs(rise - usual) > limits.NEAR)
+        if not far.size:
+            return best
+        pairs, losses = _pair(scores[:, far], length[:, far], usual)
+        loss = float(np.minimum(losses, undecided).sum())
+        if loss < least:
+            accepted, least, joined = losses < undecided, loss, best.copy()
+            joined[:, far[accepted]] = pairs[:, accepted]
+    return joined
+
+
+def _pair(scores: np.ndarray, length: np.ndarray, usual: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places (2, p) at about the usual distance that fit two neighbours best, and the
+    loss (p,) of their correlations against the best ones; see `_join`."""
+    relative = scores / np.maximum(length[:, :, None], 1e-6)
+    size = scores.shape[2]
+    near = np.arange(-limits.NEAR, limits.NEAR + 1) + usual
+    beside = np.clip(np.arange(size) + usual, 0, size - 1)
+    highest = cv2.dilate(relative[1], np.ones((1, len(near)), np.uint8))[:, beside]
+    first = (relative[0] + highest).argmax(axis=1)
+    around = np.clip(first[:, None] + near, 0, size - 1)
+    rows = np.arange(len(first))
+    second = around[rows, np.take_along_axis(relative[1], around, axis=1).argmax(axis=1)]
+    loss = relative.max(axis=2) - [relative[0, rows, first], relative[1, rows, second]]
+    return np.stack([first, second]), loss.sum(axis=0)
 
 
 def _refine(scores: np.ndarray, best: np.ndarray) -> np.ndarray:
