@@ -426,7 +426,8 @@ class RigInformation:
     def gain(self, rows: Floats) -> float:
         """Return the decrease in mm^2 of the points' mean variance by one more pose with these
         information rows."""
-        by_mode = rows.astype(np.float32) @ self.modes
+        seen = rows.any(axis=0)  # most coefficients of the fields are elsewhere in the images
+        by_mode = rows[:, seen].astype(np.float32) @ self.modes[seen]
         inner = (by_mode @ by_mode.T).astype(np.float64)
         inner[np.diag_indices(len(inner))] += 1.0
         weighted = by_mode[:, -len(self.mode_rms_mm) :] * self.mode_rms_mm
