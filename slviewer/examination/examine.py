@@ -94,7 +94,11 @@ def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evalu
         return evaluator
     if has_ghost(equal, base):
         return evaluator
-    rivals = [evaluator.compare(base, _fill_in(h)).left for h in explain(evaluator, base)]
+    # light accounts for the image, too, that a rival without order leaves out
+    rivals = [
+        evaluator.compare(base, _fill_in(h)).left * (1 if h.images else limits.AS_LITTLE)
+        for h in explain(evaluator, base)
+    ]
     return evaluator if rivals and max(rivals) < equal.compare(base, base).loss else equal
 
 

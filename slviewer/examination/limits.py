@@ -94,7 +94,8 @@ SIGMAS_OF_RIVAL = 3.0
 """Standard errors by which one frame that shows something else must explain all images better than
 another one."""
 AS_LITTLE = 1.25
-"""Share of the misfit of a hypothesis that a remedy with a rounded value may leave."""
+"""Factor of the misfit of a hypothesis that a remedy with a rounded value may leave; and of one that
+leaves an image out, that light may leave which accounts for all."""
 STRANGE_SHARE, VERY_STRANGE = 0.1, 0.15
 """Share of the misfit that its absence must remove, or squared contrast of its residual: the
 harmonics of a clipped cosine stay below both."""
