@@ -319,8 +319,10 @@ def _read_image(
 
 
 def _correlate(seen: np.ndarray, own: np.ndarray) -> float:
-    """Return the correlation of two series (p,), 0 where the second hardly varies."""
-    return float(np.corrcoef(seen, own)[0, 1]) if own.std() > 0.05 else 0.0
+    """Return the correlation of two series (p,), 0 where the first does not vary, or the second
+    hardly."""
+    varies = own.std() > 0.05 and seen.std() > 0
+    return float(np.corrcoef(seen, own)[0, 1]) if varies else 0.0
 
 
 def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> int | None:

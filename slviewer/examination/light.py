@@ -194,11 +194,21 @@ def _score(
     gain = (first - losses)[both := np.isfinite(first - losses)]
     if len(gain) < limits.FEWEST_PIXELS / 2:
         return np.inf
-    misfit = equal.compare(base, base).loss / evaluator.compare(base, base).loss
-    is_significant = gain.mean() > sigmas * gain.std() / np.sqrt(len(gain))
-    if misfit > limits.AS_WELL or not is_significant:
+    before, after = (
+        np.concatenate([m.misfit for axis in base.sequence.axes if (m := each.match(base, axis))])
+        for each in (evaluator, equal)
+    )
+    misfit = after.mean() / before.mean()
+    # a few pixels may be read otherwise by chance
+    is_worse = misfit > limits.AS_WELL and _is_above_chance(after - before, limits.SIGMAS_CONFIRMED)
+    if is_worse or not _is_above_chance(gain, sigmas):
         return np.inf
     return float(losses[both].mean() / first[both].mean() * misfit)
+
+
+def _is_above_chance(values: np.ndarray, sigmas: float) -> bool:
+    """Return whether the mean of values (p,) is positive by so many standard errors."""
+    return bool(values.mean() > sigmas * values.std() / np.sqrt(len(values)))
 
 
 def equalize_samples(
@@ -233,17 +243,18 @@ class _Residual:
     """What the patterns of one axis leave of k frames at p pixels, relative to each pixel's
     contrast.
 
-    ``frames``, ``groups`` (k,): as of `Atoms`; ``level`` (k,): rms of the levels; ``pixels``: bool,
-    of those of the sample; ``shapes``: (k, p) change of the levels with each value of the light but
-    its wave's, by name; ``left`` (k, p): the residual without the part that background, contrast
-    and displacement of a pixel take up, which ``basis`` (3, k, p) spans; ``weight`` and ``row``
-    (p,); ``entries``: independent residuals.
+    ``frames``, ``groups`` (k,): as of `Atoms`; ``level``, ``fuzzy`` (k,): rms of the levels, and
+    share of the pixels beside an edge; ``pixels``: bool, of those of the sample; ``shapes``: (k, p)
+    change of the levels with each value of the light but its wave's, by name; ``left`` (k, p): the
+    residual without the part that background, contrast and displacement of a pixel take up, which
+    ``basis`` (3, k, p) spans; ``weight`` and ``row`` (p,); ``entries``: independent residuals.
     """
 
     axis: Axis
     frames: np.ndarray
     groups: np.ndarray
     level: np.ndarray
+    fuzzy: np.ndarray
     pixels: np.ndarray
     shapes: dict[str, np.ndarray]
     left: np.ndarray
@@ -274,7 +285,9 @@ def _project(
         # between stripes blur changes the levels, at the same phase of the fringes everywhere
         beside = [atoms.at(m.coordinate[good] + d * m.rise[good])[m.places] for d in AROUND]
         is_edge, groups = np.ptp(beside, axis=0) > 0.5, atoms.groups[m.places]
+        fuzzy = is_edge.mean(axis=1)
         used = 1 - (is_edge & (groups < 0)[:, None]).astype(np.float32)
+        used[(groups < 0) & (fuzzy >= limits.FUZZY)] = limits.FUZZY_WEIGHT
         used[seen[frames] >= white] = 0
         row, column = sample.place[good].T
         over = np.ones_like(level) / light.gain[frames, None]
@@ -291,7 +304,7 @@ def _project(
         loss = np.einsum("kp,kp->p", left, left)
         weight = np.minimum(1, limits.OUTLIER * np.median(loss) / np.maximum(loss, 1e-12))
         yield _Residual(
-            axis, frames, groups, np.sqrt(np.mean(level**2, axis=1)), good,
+            axis, frames, groups, np.sqrt(np.mean(level**2, axis=1)), fuzzy, good,
             {name: shape * used for name, shape in shapes.items()}, left, basis, weight, row,
             np.count_nonzero(used) - 3 * used.shape[1],
         )  # fmt: skip
@@ -308,7 +321,7 @@ class _Normal:
     """Normal equations of ``values`` of each of n frames: ``matrix`` (v n, v n) and ``moment``
     (v n,), in units of ``loss``, the mean square of ``entries`` independent residuals.
 
-    ``level`` (n,): see `_Residual`; the level of frames that the sample does not show is
+    ``level``, ``fuzzy`` (n,): see `_Residual`; the level of frames that the sample does not show is
     0. ``groups`` (n,): a number for the steps of each period, negative for the other frames of an
     axis.
     """
@@ -320,6 +333,7 @@ class _Normal:
     entries: int
     groups: np.ndarray
     level: np.ndarray
+    fuzzy: np.ndarray
 
     @property
     def known(self) -> np.ndarray:
@@ -394,6 +408,9 @@ class _Normal:
             own = np.s_[len(of_room) : len(of_room) + blocks[name].shape[1]]
             t[place * n : place * n + n, own] = blocks[name]
             deviations[own] = PRIORS.get(name, PRIORS["level"])
+            if name == "contrast":
+                blur = np.where(self.fuzzy[other] < limits.FUZZY, *limits.CONTRAST_PRIORS)
+                deviations[own][len(periods) :] = blur
             of_room += changes if name in VALUES["room"] else [-1] * blocks[name].shape[1]
         normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
         return t, normal, t.T @ self.moment, np.array(of_room)
@@ -404,7 +421,7 @@ def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[T
     n = len(light.gain)
     values = (*(name for term in terms for name in VALUES[term]), "contrast", "level")
     matrix, moment = np.zeros((len(values), n, len(values), n)), np.zeros((len(values), n))
-    groups, level = np.full(n, -1), np.zeros(n)
+    groups, (level, fuzzy) = np.full(n, -1), np.zeros((2, n))
     squares, entries = 1e-12, 0
     for part in parts:
         f, root = part.frames, np.sqrt(part.weight)
@@ -425,10 +442,10 @@ def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[T
         entries += part.entries
         coded = np.where(level[f] > 0, groups[f], groups.min() - 1)
         groups[f] = np.where(part.groups < 0, coded, part.groups + groups.max() + 1)
-        level[f] = part.level
+        level[f], fuzzy[f] = part.level, part.fuzzy
     loss, size = squares / max(entries, 1), len(values) * n
     matrix, moment = matrix.reshape(size, size) / loss, moment.ravel() / loss
-    return _Normal(values, matrix, moment, loss, entries, groups, level)
+    return _Normal(values, matrix, moment, loss, entries, groups, level, fuzzy)
 
 
 def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Term]:

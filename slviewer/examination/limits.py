@@ -94,8 +94,8 @@ SIGMAS_OF_RIVAL = 3.0
 """Standard errors by which one frame that shows something else must explain all images better than
 another one."""
 AS_LITTLE = 1.25
-"""Factor of the misfit of a hypothesis that a remedy with a rounded value may leave; and of one that
-leaves an image out, that light may leave which accounts for all."""
+"""Factor of the misfit of a hypothesis that a remedy with a rounded value may leave; and of one
+that leaves an image out, that light may leave which accounts for all."""
 STRANGE_SHARE, VERY_STRANGE = 0.1, 0.15
 """Share of the misfit that its absence must remove, or squared contrast of its residual: the
 harmonics of a clipped cosine stay below both."""
@@ -208,3 +208,10 @@ UNKNOWN_GAIN = 0.1
 it."""
 SCATTERED = 0.03
 """Light that the scene scatters into dark stripes, of the contrast."""
+FUZZY = 0.4
+"""Share of the pixels at a stripe's edge, from which blur may have changed its contrast."""
+FUZZY_WEIGHT = 0.2
+"""Weight of their levels: blur changes them by up to a third of the contrast."""
+CONTRAST_PRIORS = 0.1, 0.5
+"""Uncertainty of the contrast of a frame's stripes: wide ones scatter light, and blur takes all of
+it from fine ones."""
