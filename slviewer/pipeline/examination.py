@@ -178,7 +178,7 @@ def warn_of_exposure(
         warn(f"{name}: {exposure.sentence} {exposure.remedy}")
 
 
-VERSION = 9
+VERSION = 10
 """Of the examination; results of another version are computed anew."""
 _NUMBERED = re.compile(
     r"\b((?:frame|image)s? )(\d+(?:(?:, | and )\d+)*)\b(?! is missing)", re.IGNORECASE

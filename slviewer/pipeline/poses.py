@@ -51,7 +51,7 @@ from slviewer.target.detect import Detection, board_mask, detect
 LINES_DEGREE = 5
 """Of the polynomial through a board's features: perspective and distortion leave less than
 noise."""
-EVIDENCE_VERSION = 10
+EVIDENCE_VERSION = 11
 """Version of the examination; evidence that was stored by another version is computed again."""
 POSES_AT_ONCE = 2
 """Poses read side by side: most of the work on one occupies one thread."""
