@@ -164,7 +164,7 @@ def _measure_steps(evaluator: Evaluator, base: Hypothesis) -> Iterator[tuple[Axi
             np.einsum("kp,kp->k", a, b)
             for a, b in ((slope, slope), (residual, slope), (residual, residual))
         )
-        weight = squares / whole * residual.shape[1]
+        weight = squares / np.maximum(whole, 1e-9) * residual.shape[1]  # frames without noise
         edges = np.array([0 if kinds[k].kind == "phase" else kinds[k].bit for k in steps])
         yield (
             axis,
