@@ -136,6 +136,9 @@ class Evaluator:
             if a is None or b is None:
                 gains.append(np.zeros(len(sample.swing)))
                 losses.append(np.zeros(0) if a is None else a.misfit)
+            elif len(a.images) == len(b.images):
+                gains.append(a.misfit - b.misfit)
+                losses.append(a.misfit)
             else:
                 common = [i for i in a.images if i in b.images]
                 total = np.maximum(sample.levels[common, 1].var(axis=0) * len(common), 1e-6)
