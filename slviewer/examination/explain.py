@@ -185,8 +185,9 @@ class _Rated:
 def _least_sigmas(rated: _Rated, gained: float) -> float:
     """Return the significance that an explanation needs: less where it gives coordinates that rise
     in a possible direction, and the description, whose directions cost ``gained``, does not."""
-    is_confirmed = gained - rated.turned > limits.IMPOSSIBLE_COST / 2
-    return limits.SIGMAS_CONFIRMED if is_confirmed else limits.SIGMAS
+    is_impossible = gained >= min(limits.MIRRORED_COST, limits.FOLDED_COST)
+    is_possible = rated.turned < gained
+    return limits.SIGMAS_CONFIRMED if is_impossible and is_possible else limits.SIGMAS
 
 
 def _net(rated: _Rated) -> float:
@@ -210,11 +211,13 @@ def _turned(evaluator: Evaluator, hypotheses: Explanation) -> float:
     rise: the same from neighbour to neighbour and over the image; camera and projector both see the
     scene from the front, and mostly stand upright."""
     J = evaluator.jacobian(hypotheses)
-    impossible, is_turned = len(evaluator.list_beyond(hypotheses)), False
-    if J is not None:
-        impossible += len(evaluator.list_folded(hypotheses, J)) + bool(np.linalg.det(J) < 0)
-        is_turned = J[0, 0] < 0 and J[1, 1] < 0
-    return limits.IMPOSSIBLE_COST * impossible + limits.TURNED_COST * is_turned
+    cost = limits.FOLDED_COST * len(evaluator.list_beyond(hypotheses))
+    if J is None:
+        return cost
+    cost += limits.FOLDED_COST * len(evaluator.list_folded(hypotheses, J))
+    if np.linalg.det(J) < 0:
+        return cost + limits.MIRRORED_COST
+    return cost + (limits.TURNED_COST if J[0, 0] < 0 and J[1, 1] < 0 else 0.0)
 
 
 def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained: float) -> bool:

@@ -124,10 +124,10 @@ PER_FRAME_COST, CHANGE_COST = 1e-4, 1e-3
 equal explanations the simplest is chosen."""
 LOST_COST = 1e-3
 """The same for a missing image, which may be any."""
-IMPOSSIBLE_COST, TURNED_COST = 0.02, 0.002
-"""The same for each axis that runs beyond the projector, or backwards from neighbour to neighbour,
-and for a mirror image of what the camera sees, which no device shows; and for a projector upside
-down, which is rare."""
+MIRRORED_COST, TURNED_COST, FOLDED_COST = 0.02, 0.002, 0.02
+"""The same for coordinates that are a mirror image of what the camera sees, which no device shows;
+for a projector upside down, which is rare; and for an axis that runs backwards from neighbour to
+neighbour, or beyond the projector."""
 
 OUTSIDE = 0.08, 0.02
 """Share of the coordinates beyond the projector, that noise of fine periods does not reach, and

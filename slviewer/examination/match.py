@@ -138,27 +138,23 @@ def _fit_groups(
     stripes = groups < 0
     x, y = predicted[stripes][:, good], relative[stripes]
     if x.size and x.var() > limits.VARIED_STRIPES:  # they are what fringes are compared with
-        slope = _regress(x, y, 1 / limits.CONTRASTS[1], limits.CONTRASTS[1])
+        slope = np.mean((x - x.mean()) * (y - y.mean())) / x.var()
+        slope = np.float32(np.clip(slope, 1 / limits.CONTRASTS[1], limits.CONTRASTS[1]))
         relative = (relative - y.mean()) / slope + x.mean()
     for group in range(groups.max() + 1):
         own = groups == group
         if np.count_nonzero(own) < 3:
             continue
         x, y = predicted[own][:, good].ravel(), relative[own].ravel()
-        slope, middle = _regress(x, y, *limits.CONTRASTS), x.mean()
-        spread = np.mean((x - middle) ** 2)
-        curve = _regress((x - middle) ** 2, y - slope * x, -slope / 2, slope / 2)
+        middle, spread = x.mean(), np.float32(max(float(x.var()), 1e-3))
+        slope = np.mean((x - middle) * (y - y.mean())) / spread
+        slope = np.float32(np.clip(slope, *limits.CONTRASTS))
+        bent = (x - middle) ** 2 - spread
+        curve = np.mean(bent * (y - slope * (x - middle))) / max(float(bent.var()), 1e-3)
+        curve = np.float32(np.clip(curve, -slope / 2, slope / 2))
         z = predicted[own] - middle
         out[own] = y.mean() + slope * z + curve * (z**2 - spread)
     return out
-
-
-def _regress(
-    x: np.ndarray, y: np.ndarray, least: float | np.float32, most: float | np.float32
-) -> np.float32:
-    """Return the slope of ``y`` over ``x``, within limits."""
-    x0 = x - x.mean()
-    return np.float32(np.clip(np.mean(x0 * (y - y.mean())) / max(x0.var(), 1e-3), least, most))
 
 
 def _join(scores: np.ndarray, length: np.ndarray, undecided: float) -> np.ndarray:
