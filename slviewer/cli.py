@@ -187,7 +187,7 @@ def make_command(name: str) -> Function:
     operation = getattr(sys.modules.get("slviewer.pipeline.operation"), "OPERATIONS", {}).get(name)
     if operation is None:
         near = "".join(f" (did you mean {each}?)" for each in get_close_matches(name, COMMANDS, 1))
-        raise UsageError(f"there is no command {name}{near}: `slviewer --help` lists them")
+        raise UsageError(f"unknown command {name}{near}: `slviewer --help` lists all commands")
     required = [each.name for each in fields(operation.settings) if each.default is MISSING]
     source = f"{operation.function.__module__}:{operation.function.__name__}"
     return read_command(source, *required, options=JSON)
@@ -210,7 +210,7 @@ def main(arguments: list[str] | None = None) -> int:
         arguments = ["wizard"]
     name, *rest = arguments
     try:
-        if arguments in (["--version"], ["-h"], ["--help"]):
+        if name in ("--version", "-h", "--help"):
             print(f"slviewer {__version__}" if name == "--version" else list_commands())
             return 0
         tyro.cli(make_command(name), prog=f"slviewer {name}", args=rest, config=CONFIG)()

@@ -187,17 +187,18 @@ class Evaluator:
             slopes.append(fit[:0:-1])
         return np.array(slopes) if len(slopes) == 2 else None
 
-    def list_beyond(self, hypotheses: Sequence[Hypothesis]) -> dict[Axis, np.ndarray]:
-        """Return the coordinates px of each axis of which too many lie beyond the projector, under
-        the hypotheses."""
-        out: dict[Axis, np.ndarray] = {}
+    def list_beyond(self, hypotheses: Sequence[Hypothesis]) -> dict[Axis, tuple[np.ndarray, float]]:
+        """Return the coordinates (p,) px of each axis of which too large a share lies beyond the
+        projector, under the hypotheses, and that share."""
+        out: dict[Axis, tuple[np.ndarray, float]] = {}
         for axis in self.sample.by_axis:
             own = _select_own(hypotheses, axis)
             sequence, m = own.sequence, self.match(own, axis)
             if m is not None and sequence.projector_size:
-                u, limit = m.coordinate[m.misfit < limits.GOOD], sequence.extent(axis) + 0.5
-                if np.sum(u > limit) > limits.OUTSIDE[bool(sequence.find("gray", axis))] * u.size:
-                    out[axis] = u
+                u = m.coordinate[m.misfit < limits.GOOD]
+                share = float(np.mean(u > sequence.extent(axis) + 0.5)) if u.size else 0.0
+                if share > limits.OUTSIDE[bool(sequence.find("gray", axis))]:
+                    out[axis] = u, share
         return out
 
     def list_folded(self, hypotheses: Sequence[Hypothesis], jacobian: np.ndarray) -> list[Axis]:

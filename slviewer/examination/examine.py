@@ -61,11 +61,11 @@ def _judge(
         return [describe_missing_pattern(sample)]
     ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
     found, coordinates = explain(evaluator, base), [*_judge_coordinates(evaluator, base)]
-    named = _describe_explanation(found, evaluator, base)
-    if coordinates and any(each.cause == "moved" for each in named):
-        named = []  # codes that cannot be are displaced as well
-    if named and not _is_imitated(found, evaluator, bool(ghost), bool(motion)):
-        return named
+    if found and not _is_imitated(found, evaluator, bool(ghost), bool(motion)):
+        named = _describe_explanation(found, evaluator, base)
+        # codes that cannot be are displaced as well
+        if not (coordinates and any(each.cause == "moved" for each in named)):
+            return named
     if motion and not ghost and not coordinates:
         return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
     judged = [*_judge_readability(evaluator, base), *coordinates]
@@ -128,8 +128,6 @@ def _describe_explanation(
     An offset of the phase that is no convention, on one axis of several periods captured one after
     the other, is motion between them.
     """
-    if not found:
-        return []
     sequence, first, axis = base.sequence, found[0], found[0].axis
     if first.cause == "moved" and axis is not None and first.value is not None:
         return [describe_motion(sequence, axis, first.value)]
@@ -180,7 +178,7 @@ def _judge_coordinates(evaluator: Evaluator, base: Hypothesis) -> Iterator[Findi
             yield Finding("projector-size", "rejected", text, remedy, (), (), axis)
             continue
         if axis in beyond:
-            yield describe_reach(axis, sequence.extent(axis), beyond[axis])
+            yield describe_reach(axis, sequence.extent(axis), *beyond[axis])
 
 
 def _judge_light(

@@ -303,9 +303,9 @@ def mirroring_remedy(of_projector: str) -> str:
     )
 
 
-def describe_reach(axis: Axis, extent: int, coordinate: np.ndarray) -> Finding:
-    """Return the finding of coordinates (p,) px of which many lie beyond the projector."""
-    reach, share = float(np.quantile(coordinate, 0.995)), np.mean(coordinate > extent + 0.5)
+def describe_reach(axis: Axis, extent: int, coordinate: np.ndarray, share: float) -> Finding:
+    """Return the finding of coordinates (p,) px of which a ``share`` lies beyond the projector."""
+    reach = float(np.quantile(coordinate, 0.995))
     text = (
         f"{100 * share:.0f} % of the {axis} codes lie outside the projector's {extent}"
         f" {LINES[axis]} and reach {reach:.0f}"

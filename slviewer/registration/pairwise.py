@@ -252,16 +252,16 @@ def _find_rival(
 ) -> Registration | None:
     """Return the result of ICP from the first of the ``others`` that ends at a different pose, and
     fits as well; ``score``: of the result's own start."""
-    nearest = RIVAL_GATES * result.gate_mm
+    nearest, T = RIVAL_GATES * result.gate_mm, result.T_reference_scan
     for other in others:
-        gap = pose_distance(scan.fine_points, result.T_reference_scan, other.T)
-        if gap <= nearest or not other.score >= RIVAL_SCORE * score:
+        is_same = pose_distance(scan.fine_points, T, other.T) <= nearest
+        if is_same or not other.score >= RIVAL_SCORE * score:
             continue
         try:
             rival = _refine_start(scan, reference, other, size)
         except Refused:
             continue
-        gap = pose_distance(scan.fine_points, result.T_reference_scan, rival.T_reference_scan)
+        gap = pose_distance(scan.fine_points, T, rival.T_reference_scan)
         distinct = gap > max(nearest, 10.0 * result.uncertainty.shift_mm)
         alike = (
             rival.overlap >= RIVAL_OVERLAP * result.overlap

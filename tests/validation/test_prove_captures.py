@@ -230,3 +230,20 @@ def test_what_few_phase_steps_hide_is_named(
     case = examine_case(fault, kind, seed)
     assert case.outcome == "right", case.text()
     assert {named.cause for named in case.named} == {cause}
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize(
+    ("fault", "kind", "seed"),
+    [
+        ("lamp switched on", "micro", 71000),  # after the first image of an axis
+        ("black frame", "p18", 9001),  # a Gray bit without inverse: two places fit
+        ("drift of 8 %", "p18", 91000),  # two pixels are read otherwise by chance
+        ("random exposure", "complementary", 92000),
+        ("clipped cosine", "micro", 51000),  # the finest period has eight steps
+        (NO_FAULT, "p18", 51004),  # edges are misread in lines
+    ],
+)
+def test_what_another_cause_imitates_is_named(fault: str, kind: CaptureKind, seed: int) -> None:
+    case = examine_case(fault, kind, seed)
+    assert case.outcome == ("sound" if fault == NO_FAULT else "right"), case.text()
