@@ -1,5 +1,5 @@
-"""Signed deviations of a scan from a nominal model after best-fit alignment: their statistics and
-colours, and whether they stay within a tolerance, as far as their uncertainty lets one say."""
+"""Signed deviations of a scan from a nominal model after best-fit alignment, their statistics and
+colours; and what of the nominal was measured, and what of it is missing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,15 +14,30 @@ from slviewer.geometry.rigid import (
     Uncertainty,
     move_points,
 )
-from slviewer.geometry.vectors import rms, subsample, unit_vectors
-from slviewer.inspection.nominal_surface import REACH, NominalSurface, fit_pose, search_pose
+from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import lengths, rms, subsample, unit_vectors
+from slviewer.inspection.exclusion import NOISE, ClassifiedPoints, LocatedPoints, classify_points
+from slviewer.inspection.nominal_surface import (
+    GOOD_ERROR,
+    REACH,
+    NominalSurface,
+    fit_pose,
+    search_pose,
+)
 from slviewer.inspection.uncertainty import scatter_covariance
-from slviewer.records.acceptance import Decision, worst_decision
-from slviewer.records.measurement import LEAST_AREA, ToleranceVerdict
+from slviewer.inspection.wrong_part import explain_misfit
+from slviewer.records.measurement import ExcludedPoints
 from slviewer.registration.pairwise import Progress
+from slviewer.registration.refusal import Refused, WrongPart
 from slviewer.surface.shapes import Mesh
 
 NOISE_REACH = 10.0
+ROBUST_SIGMAS, ROBUST_STEP, ROBUST_ROUNDS = 4.685, 0.8, 4
+"""Of the deviations' robust standard deviation: points beyond do not count in the best fit, so that
+the error of one feature does not spread over the part. The fit is repeated where that brings the
+limit down to this share of the last."""
+RAY_NEIGHBOURS = 4
+"""Points about a ray that must all lie behind a place for it to be missing."""
 COVERAGE_SAMPLES = 20_000
 MIN_SEEN_COSINE = 0.45
 """Of a place on the nominal that a view can measure: at more oblique ones points are few."""
@@ -36,12 +51,29 @@ spacings."""
 
 @dataclass(frozen=True, eq=False)
 class NominalArea:
-    """Places (n, 3) mm evenly over the nominal's area, in its frame; which of them were
-    ``measured``, and which the views can see, (n,) bool."""
+    """Places (n, 3) mm evenly over the nominal's area, in its frame.
+
+    ``gap_mm`` (n,): from each to where the scan was measured on the nominal; ``spacing_mm``: nearer
+    ones were ``measured``, (n,) bool, and so were those that deviate; ``deviation`` (n,) mm: how
+    far the part is from these, NaN for others, and ``counterpart`` (n, 3) where it is instead, as
+    far as it was measured there. ``is_visible`` (n,) bool: to the views.
+    """
 
     places: Floats
     measured: Mask
     is_visible: Mask
+    gap_mm: Floats
+    deviation: Floats
+    counterpart: Floats
+    spacing_mm: float
+
+    @property
+    def largest_gap(self) -> tuple[float, Floats]:
+        """Diameter in mm of the largest visible spot that was not measured, and its middle (3,); 0
+        where there is none."""
+        gaps = np.where(self.is_visible & ~self.measured, self.gap_mm, 0.0)
+        worst = int(np.argmax(gaps))
+        return 2 * float(gaps[worst]), self.places[worst]
 
     def percent_measured(self, within: Mask | None = None) -> float | None:
         """Percent of the visible area, of the places ``within`` (n,) bool alone, that was measured;
@@ -57,12 +89,14 @@ class Deviation:
     """A scan's points against a nominal model.
 
     ``signed`` (n,) float32 mm: of each scan point, positive outside the nominal; NaN for points
-    farther than ``reach_mm``, or that face another way. ``T_nominal_scan`` (4, 4) is the best fit;
-    ``normals`` (n, 3) the nominal's where each point's nearest place is, in the scan's frame, NaN
-    likewise. ``area``: what of the nominal was measured. ``alignment_mm``: standard uncertainty
-    that the best fit adds to a point, RMS over the points; ``alignment_spread`` its covariance, in
-    the nominal's frame. ``surface``: the nominal, of whose triangles ``turned`` faced away from the
-    scan.
+    that are ``excluded`` because they cannot be the part; ``is_unmatched`` (n,) bool: farther than
+    ``reach_mm``, or facing another way, and deviations all the same. ``T_nominal_scan`` (4, 4) is
+    the best fit; ``normals`` (n, 3) the nominal's where each point's nearest place is, in the
+    scan's frame, NaN likewise. ``area``: what of the nominal was measured. ``alignment_mm``:
+    standard uncertainty that the best fit adds to a point, RMS over the points;
+    ``alignment_spread`` its covariance, in the nominal's frame. ``noise_mm``: standard deviation of
+    a point; ``located`` and ``facing`` (n, 3): the points and their normals in the nominal's frame.
+    ``surface``: the nominal, of whose triangles ``turned`` faced away from the scan.
     """
 
     signed: np.ndarray
@@ -73,6 +107,11 @@ class Deviation:
     alignment_mm: float
     alignment_spread: Uncertainty
     surface: NominalSurface
+    is_unmatched: Mask
+    excluded: tuple[ExcludedPoints, ...]
+    noise_mm: float
+    located: Floats
+    facing: Floats | None
     turned: int = 0
 
     @property
@@ -156,9 +195,16 @@ def deviation(
     T = initial
     if T is None:
         has_camera = views is not None
-        T = search_pose(
-            points, normals, surface, sigma_mm, lambda share: report(0.6 * share), has_camera
-        )
+        try:
+            T = search_pose(
+                points, normals, surface, sigma_mm, lambda share: report(0.6 * share), has_camera
+            )
+        except Refused as refusal:
+            near = max(GOOD_ERROR * surface.diagonal, NOISE * (sigma_mm or 0.0))
+            other = explain_misfit(points, normals, nominal, None, near, has_camera)
+            if other:
+                raise WrongPart(f"The scan does not show the nominal model: {other}.") from refusal
+            raise
     turned = np.zeros(len(nominal.faces), bool)
     if normals is not None:
         turned = surface.seen_from_behind(points, normals, T, reach_mm)
@@ -169,19 +215,21 @@ def deviation(
         points, normals, surface, T, reach_mm, lambda share: report(0.6 + 0.2 * share)
     )
     report(0.8)
-    signed, towards = surface.distances(points, normals, T, reach_mm)
-    counted = np.isfinite(signed)
-    if not counted.any():
+    scan = _locate(points, normals, surface, T, sigma_mm or 0.0)
+    placed_views = [move_points(T, centres) for centres in views or ()]
+    found = classify_points(scan, surface, reach_mm, placed_views)
+    counted = np.isfinite(found.signed)
+    if not (counted & ~found.is_unmatched).any():
         raise InputError(
             f"No point of the scan lies within {reach_mm:.3g} mm of the nominal model: does it show"
             " that part?"
         )
     report(0.95)
-    feet = move_points(T, points[counted]) - signed[counted, None] * towards[counted]
-    area = _measure_area(feet, surface, [move_points(T, centres) for centres in views or ()])
+    area = _measure_area(scan, found, surface, placed_views)
     report(1.0)
+    towards = np.where(counted[:, None], scan.towards, np.nan)
     return Deviation(
-        signed.astype(np.float32),
+        found.signed.astype(np.float32),
         (towards @ T[:3, :3]).astype(np.float32),
         T,
         reach_mm,
@@ -189,8 +237,32 @@ def deviation(
         alignment,
         spread,
         surface,
+        found.is_unmatched,
+        found.excluded,
+        scan.noise_mm,
+        scan.points,
+        scan.normals,
         int(turned.sum()),
     )
+
+
+def _locate(
+    points: Floats, normals: Floats | None, surface: NominalSurface, T: Floats, noise: float
+) -> LocatedPoints:
+    """Return the scan's points at its pose ``T`` (4, 4), with their places on the nominal."""
+    moved = move_points(T, points)
+    away, towards = surface.signed(moved)
+    some = subsample(moved, MAX_FEET)
+    tree = cKDTree(some, balanced_tree=False, compact_nodes=False)
+    stride = max(1, len(some) // 2000)
+    gaps, pairs = tree.query(some[::stride], k=2)
+    spacing = SPACINGS * float(np.percentile(gaps[:, 1], 95))
+    # form hardly differs between neighbours
+    ends = subsample(away, MAX_FEET)[pairs]
+    steps = np.diff(ends[np.isfinite(ends).all(axis=1)], axis=1)
+    noise = max(noise, robust_sigma(steps, about=0.0) / np.sqrt(2)) if len(steps) else noise
+    turned = None if normals is None else normals @ T[:3, :3].T
+    return LocatedPoints(moved, turned, away, towards, spacing, noise)
 
 
 def _refine_best_fit(
@@ -206,6 +278,12 @@ def _refine_best_fit(
     points = subsample(points, MAX_ALIGNED_POINTS)
     normals = None if normals is None else subsample(normals, MAX_ALIGNED_POINTS)
     T, moved, J, away = fit_pose(points, normals, surface, T, reach, report=report)
+    for _ in range(ROBUST_ROUNDS):
+        gate = ROBUST_SIGMAS * robust_sigma(away, about=0.0)
+        if not 0 < gate < ROBUST_STEP * reach:
+            break
+        reach = gate
+        T, moved, J, away = fit_pose(points, normals, surface, T, reach)
     covariance = scatter_covariance(moved, J, away)
     return (
         T,
@@ -214,15 +292,15 @@ def _refine_best_fit(
     )
 
 
-def _measure_area(feet: Floats, surface: NominalSurface, views: Sequence[Floats]) -> NominalArea:
-    """What of the nominal was measured. ``feet`` (n, 3): where on it the scan's points were
-    measured; ``views`` as in `deviation`, in its frame."""
+def _measure_area(
+    scan: LocatedPoints, found: ClassifiedPoints, surface: NominalSurface, views: Sequence[Floats]
+) -> NominalArea:
+    """What of the nominal was measured, and how far the part is from places that deviate; ``views``
+    as in `deviation`, in its frame."""
     places, facing = surface.sample(COVERAGE_SAMPLES, seed=1)
-    thin = subsample(feet, MAX_FEET)
-    tree = cKDTree(thin)
-    spacing, _ = tree.query(subsample(thin, 2000), k=2)
-    away, _ = tree.query(places, workers=-1)
-    measured = away <= SPACINGS * float(np.percentile(spacing[:, 1], 95))
+    matched = np.isfinite(found.signed) & ~found.is_unmatched
+    feet = scan.points[matched] - found.signed[matched, None] * scan.towards[matched]
+    gap, _ = cKDTree(subsample(feet, MAX_FEET)).query(places, workers=-1)
     is_visible = np.full(len(places), not views)
     for centres in views:
         is_visible |= np.all(
@@ -232,53 +310,58 @@ def _measure_area(feet: Floats, surface: NominalSurface, views: Sequence[Floats]
             ],
             axis=0,
         )
-    return NominalArea(places, measured, is_visible)
-
-
-def judge_deviation(
-    deviation: Deviation, sigma_mm: Floats, tolerance_mm: float, least_area: float = LEAST_AREA
-) -> ToleranceVerdict:
-    """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the
-    surface's normal; ``least_area``: percent of the visible area that it needs."""
-    if not tolerance_mm > 0:
-        raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
-    counted = deviation.counted
-    signed = deviation.signed[counted].astype(np.float64)
-    U = 2 * np.hypot(np.nan_to_num(sigma_mm[counted].astype(np.float64)), deviation.alignment_mm)
-    typical = float(np.median(U))
-    off = np.abs(signed)
-    inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
-    numbers = deviation.statistics()
-    low, high = (
-        (end, judge_limits(end, typical, -tolerance_mm, tolerance_mm))
-        for end in (numbers["p_low"], numbers["p_high"])
-    )
-    area = deviation.area.percent_measured() or 0.0
-    return ToleranceVerdict(
-        tolerance_mm,
-        typical,
-        low,
-        high,
-        "undecided" if area < least_area else worst_decision({low[1], high[1]}),
-        100 * float(np.mean(off <= tolerance_mm)),
-        100 * float(inside.mean()),
-        100 * float(outside.mean()),
-        100 * float(np.mean(~inside & ~outside)),
-        area,
-        least_area,
+    measured = gap <= scan.spacing_mm
+    deviation, counterpart = np.full(len(places), np.nan), places.copy()
+    open_places = np.flatnonzero(~measured)
+    far = np.flatnonzero(found.is_unmatched)
+    if len(far) and len(open_places):
+        near, which = cKDTree(scan.points[far]).query(places[open_places], workers=-1)
+        part = cKDTree(subsample(scan.points[matched], MAX_FEET))
+        deviates = near <= part.query(places[open_places], workers=-1)[0]
+        chosen, which = open_places[deviates], far[which[deviates]]
+        offsets = scan.points[which] - places[chosen]
+        across = np.abs(np.einsum("ij,ij->i", offsets, facing[chosen]))
+        distance = lengths(offsets)  # beside a short one, the points' spacing counts
+        value = np.where(distance > 2 * scan.spacing_mm, distance, across)
+        sign = np.where(found.signed[which] < 0, -1.0, 1.0)
+        if scan.normals is not None:  # a place in the open is missing
+            height = np.einsum("ij,ij->i", offsets, scan.normals[which])
+            sign = np.where(np.isfinite(height), np.sign(height), sign)
+        deviation[chosen], counterpart[chosen] = sign * value, scan.points[which]
+    if len(views) == 1 and len(open_places):
+        passed = open_places[is_visible[open_places]]
+        depth = _depth_behind(scan, places[passed], views[0][0])
+        through = passed[depth > scan.spacing_mm]
+        deviation[through] = -np.fmax(np.abs(deviation[through]), depth[depth > scan.spacing_mm])
+    return NominalArea(
+        places,
+        measured | np.isfinite(deviation),
+        is_visible,
+        gap,
+        deviation,
+        counterpart,
+        scan.spacing_mm,
     )
 
 
-def judge_limits(value: float, U: float, lower: float | None, upper: float | None) -> Decision:
-    """Decide by guard bands whether a value of expanded uncertainty U (k = 2) lies between limits,
-    of which one may be absent: "pass" inside both by U, "fail" beyond one by more than U, else
-    "undecided"."""
-    low, high = (-np.inf if lower is None else lower), (np.inf if upper is None else upper)
-    if not (np.isfinite(value) and np.isfinite(U)):
-        return "undecided"
-    if low + U <= value <= high - U:
-        return "pass"
-    return "fail" if value < low - U or value > high + U else "undecided"
+def _depth_behind(scan: LocatedPoints, places: Floats, camera: Floats) -> Floats:
+    """Return by how much (n,) mm the scan's points about the ray from the ``camera`` (3,) to each
+    place (n, 3) lie behind it, all of them; 0 where some do not, or none is near."""
+    if not len(places):
+        return np.zeros(0)
+    rays = scan.points - camera
+    if scan.normals is not None:  # what faces away was seen from elsewhere
+        rays = rays[~(np.einsum("ij,ij->i", rays, scan.normals) > 0)]
+    depth = lengths(rays)
+    wanted = places - camera
+    distance = lengths(wanted)
+    tree = cKDTree(rays / depth[:, None], balanced_tree=False, compact_nodes=False)
+    limit = scan.spacing_mm / float(np.median(depth))
+    _, which = tree.query(
+        wanted / distance[:, None], k=RAY_NEIGHBOURS, distance_upper_bound=limit, workers=-1
+    )
+    behind = np.append(depth, -np.inf)[which] - distance[:, None]
+    return np.maximum(behind.min(axis=1), 0.0)
 
 
 EXCLUDED_COLOUR = (150, 154, 160)

@@ -77,7 +77,20 @@ class NominalSurface:
         half, first, _, triangles = count_edges(mesh.faces)
         self._at_rim = np.zeros(len(vertices), bool)
         self._at_rim[half[first[triangles == 1]]] = True
+        self.is_closed = not (triangles == 1).any()
+        self.vertices = vertices
         self._scene = raycasting_scene(vertices - self.middle, mesh.faces)
+
+    def gaps(self, points: Floats) -> Floats:
+        """Distances (n,) mm of places (n, 3) from the surface, without a sign."""
+        centred = (points - self.middle).astype(np.float32)
+        found = self._scene.compute_distance(open3d().core.Tensor(centred)).numpy()
+        return np.asarray(found, np.float64)
+
+    def is_hit(self, origins: Floats, directions: Floats) -> Mask:
+        """Return which rays (n, 3), (n, 3) meet the surface: (n,) bool."""
+        rays = np.concatenate([origins - self.middle, directions], axis=1).astype(np.float32)
+        return np.asarray(self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy(), bool)
 
     def signed(self, points: Floats) -> tuple[Floats, Floats]:
         """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open
@@ -176,6 +189,9 @@ GOOD_ERROR = 0.002
 GOOD_OVERLAP, GOOD_AGREEMENT, NEAR = 0.6, 0.95, 5.0
 """Shares of the scan, and of its points within so many reaches of the nominal, that fit well: no
 better pose is searched for."""
+PATIENCE, BETTER_COST = 8, 0.95
+"""Sides searched without a pose of so much lower cost, after a likely one whose points do not all
+fit well: a part with an error has no better one."""
 LEAST_SCORE = 0.1
 """Share of the scan that must lie on the nominal after the coarse search: from there on a pose is
 fitted. The part itself reaches 0.5 and more, other parts below 0.15."""
@@ -209,6 +225,11 @@ class NominalPose:
     agreement: float
     is_good: bool
     gate_mm: float
+
+    @property
+    def is_likely(self) -> bool:
+        """Whether most of the scan lies on the nominal."""
+        return self.overlap >= GOOD_OVERLAP and self.agreement >= LEAST_AGREEMENT
 
 
 def fit_pose(
@@ -280,10 +301,10 @@ def search_pose(
     few = subsample(points, FITTED_POINTS)
     few_normals = None if normals is None else subsample(normals, FITTED_POINTS)
     best: NominalPose | None = None
-    score = 0.0
+    score, in_vain = 0.0, 0
     for side, camera in _list_sides(surface, has_camera, report):
         starts = search_starts(scan, side, min(scan.size, side.size))
-        score = max(score, starts[0].score)
+        score, in_vain = max(score, starts[0].score), in_vain + 1
         for start in starts:
             if start.score < LEAST_SCORE:
                 break
@@ -291,8 +312,9 @@ def search_pose(
             with suppress(InputError):  # hardly any of it lies there
                 pose = _fit_start(few, few_normals, surface, T, sigma_mm)
                 if best is None or pose.cost < best.cost:
+                    in_vain = 0 if best is None or pose.cost < BETTER_COST * best.cost else in_vain
                     best = pose
-        if best is not None and best.is_good:
+        if best is not None and (best.is_good or (best.is_likely and in_vain >= PATIENCE)):
             break
     if best is None:
         raise Refused(

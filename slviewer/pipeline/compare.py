@@ -14,8 +14,10 @@ from slviewer.inspection.deviation import (
     colour_limit,
     deviation,
     deviation_colours,
-    judge_deviation,
 )
+from slviewer.inspection.exclusion import NOISE
+from slviewer.inspection.tolerance import judge_deviation
+from slviewer.inspection.wrong_part import explain_misfit
 from slviewer.pipeline.measure import (
     LoadSurface,
     MeasuredSurface,
@@ -123,9 +125,12 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
     towards = np.nan_to_num(result.normals.astype(np.float64))
     verdict = None
     if settings.tolerance is not None:
-        verdict = judge_deviation(
-            result, on.sigma_along(towards, whole=True), settings.tolerance, settings.min_area
-        )
+        noise, whole = on.sigma_along(towards), on.sigma_along(towards, whole=True)
+        common = np.sqrt(np.maximum(whole**2 - noise**2, 0.0))
+        verdict = judge_deviation(result, noise, settings.tolerance, settings.min_area, common)
+        if verdict.decision != "pass":
+            job.progress(0.9, "trying the mirror image and other sizes")
+            verdict = verdict.of_other_part(_explain_misfit(on, nominal, result, verdict))
     described = _describe(nominal, result, on.sigma_along(towards), verdict)
     place, folder = path.expanduser().absolute(), store.folder.absolute()
     recorded = place.relative_to(folder) if place.is_relative_to(folder) else place
@@ -177,6 +182,21 @@ def fit_to_nominal(
     )
 
 
+def _explain_misfit(
+    surface: MeasuredSurface, nominal: Nominal, result: Deviation, verdict: ToleranceVerdict
+) -> str:
+    """Return what other part the scan shows, in words; empty where it is the nominal one."""
+    measured = surface.measured
+    return explain_misfit(
+        surface.points[measured].astype(np.float64)[result.counted],
+        None if surface.normals is None else surface.normals[measured][result.counted],
+        nominal.mesh,
+        result.T_nominal_scan,
+        max(verdict.tolerance_mm, NOISE * result.noise_mm),
+        bool(surface.model),
+    )
+
+
 def _describe(
     nominal: Nominal, result: Deviation, sigma_mm: np.ndarray, verdict: ToleranceVerdict | None
 ) -> NominalDeviation:
@@ -200,6 +220,7 @@ def _describe(
         alignment_mm=result.alignment_mm,
         T_nominal_scan=to_matrix(result.T_nominal_scan),
         verdict=verdict,
+        excluded=result.excluded,
     )
 
 

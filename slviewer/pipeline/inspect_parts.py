@@ -14,7 +14,7 @@ from scipy.special import chdtri, ndtri
 
 from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.geometry.rigid import Uncertainty, move_points
-from slviewer.inspection.deviation import NominalArea, judge_limits
+from slviewer.inspection.deviation import NominalArea
 from slviewer.inspection.features import Feature, relation
 from slviewer.inspection.fitting import (
     FeatureFit,
@@ -26,6 +26,7 @@ from slviewer.inspection.fitting import (
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
+from slviewer.inspection.tolerance import judge_limits
 from slviewer.inspection.uncertainty import PointErrors
 from slviewer.pipeline.compare import fit_to_nominal
 from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface

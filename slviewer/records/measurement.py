@@ -2,7 +2,7 @@
 nominal models; and a measured number with its unit and uncertainty."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import msgspec
@@ -60,8 +60,8 @@ LEAST_AREA = 90.0
 """Percent of the area that the views can see which a verdict needs."""
 DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
 RULE = (
-    "decided with a guard band as in ISO 14253-1: pass if the deviations of 99.7 % of the points"
-    " and their expanded uncertainty (k = 2) together stay within the tolerance, fail if one"
+    "decided with a guard band as in ISO 14253-1 on local means of the deviations: pass if all of"
+    " them and their expanded uncertainty (k = 2) together stay within the tolerance, fail if one"
     " exceeds it by more than the uncertainty, else too close to tell"
 )
 _UNCERTAINTY = (
@@ -138,15 +138,66 @@ class DeviationStatistics(msgspec.Struct, frozen=True):
     left_out: Count
 
 
+Exclusion = Literal["alone", "table", "beside", "touching", "border"]
+"""Why points of a scan are not taken for the part: spikes; a plane that the part stands on;
+something beside its footprint that does not touch it, or does; points at the border of these."""
+EXCLUSIONS: dict[Exclusion, str] = {
+    "alone": "isolated points",
+    "table": "a plane beside the part, as a table",
+    "beside": "something beside the part",
+    "touching": "something beside the part that touches it",
+    "border": "points on the border of these",
+}
+PlaceKind = Literal["high", "low", "excess", "missing"]
+PLACE_KINDS: dict[PlaceKind, str] = {
+    "high": "too high",
+    "low": "too low",
+    "excess": "material where the model has none",
+    "missing": "material of the model is missing",
+}
+
+
+class ExcludedPoints(msgspec.Struct, frozen=True):
+    """Points of a scan that are not taken for the part: why, how many, and where: their middle in
+    the nominal's frame and their extent, mm."""
+
+    reason: Exclusion
+    points: Count
+    place: Vector
+    across_mm: float = 0.0
+
+    def text(self) -> str:
+        """Return reason, size and place in words."""
+        where = ", ".join(f"{x:.1f}" for x in self.place)
+        extent = f", {self.across_mm:.3g} mm across at ({where})" if self.across_mm else ""
+        return f"{EXCLUSIONS[self.reason]} ({self.points:,}{extent})"
+
+
+class DeviatingPlace(msgspec.Struct, frozen=True):
+    """A connected area out of tolerance: its worst ``place`` in the nominal's frame, the deviation
+    ``value_mm`` there, positive outside, with its expanded uncertainty (k = 2), and its extent."""
+
+    kind: PlaceKind
+    place: Vector
+    value_mm: float
+    U_mm: float
+    across_mm: float
+    points: Count
+
+
 @dataclass(frozen=True)
 class ToleranceVerdict:
     """Deviations against plus and minus a tolerance, mm.
 
-    ``lowest`` and ``highest``: the ends of the range of 99.7 % of the points, each with its
-    decision; ``decision`` of both. Percent of the points that lie ``within`` it, ``inside`` it by
-    more than U, ``outside`` it by more than U, and too ``close`` to tell. ``U_mm``: expanded
-    uncertainty (k = 2) of a point, in the median. ``area``: percent of the area that the views can
-    see which was measured; below ``least_area`` nothing is decided.
+    ``lowest`` and ``highest``: the least and the largest local mean of the deviations, each with
+    its decision. Percent of the points that lie ``within`` the tolerance, ``inside`` it by more
+    than U, ``outside`` it by more than U, and too ``close`` to tell. ``U_mm``: expanded uncertainty
+    (k = 2) of a local mean, in the median. ``area``: percent of the area that the views can see
+    which was measured; below ``least_area``, and where the largest unmeasured spot is larger than
+    ``most_gap_mm``, nothing passes. ``places``: where the tolerance is exceeded, the worst first.
+    ``spot_mm``: diameter of the smallest spot whose error is seen, and ``gap_mm`` of the largest
+    that was not measured, at ``gap_place`` in the nominal's frame. ``reason``: why the scan does
+    not show this part; ``doubts``: what else keeps it from passing.
     """
 
     tolerance_mm: float
@@ -160,25 +211,64 @@ class ToleranceVerdict:
     close: float
     area: float | None = None
     least_area: float = 0.0
+    places: tuple[DeviatingPlace, ...] = ()
+    spot_mm: float | None = None
+    gap_mm: float | None = None
+    gap_place: Vector | None = None
+    reason: str = ""
+    doubts: tuple[str, ...] = ()
 
     def text(self) -> str:
         """Return the decision in words."""
         decided = DECIDED[self.decision]
-        if self.area is not None and self.area < self.least_area:
-            decided = (
-                f"undecided: {self.area:.1f} % of the area that the views can see was measured, and"
-                f" {self.least_area:g} % are needed; see that the scan shows this part, scan what"
-                " is missing and merge, or give a smaller --min-area"
-            )
+        if self.decision == "fail" and self.reason:
+            decided = f"fail: {self.reason}"
+        elif self.decision == "fail" and self.places:
+            decided = f"fail: {_describe_place(self.places[0])}"
+            if more := len(self.places) - 1:
+                decided += f", and {more} more place{'s' if more > 1 else ''}"
+        elif self.decision == "undecided" and self.doubts:
+            decided = f"undecided: {'; '.join(self.doubts)}"
         return f"Tolerance ± {self.tolerance_mm:g} mm: {decided}"
+
+    def of_other_part(self, reason: str) -> "ToleranceVerdict":
+        """Return the verdict that the scan shows another part; this one without a ``reason``."""
+        return replace(self, decision="fail", reason=reason) if reason else self
+
+    def describe_evidence(self) -> str:
+        """Return what the decision rests on in a sentence; empty for an old one."""
+        if self.area is None or self.spot_mm is None:
+            return ""
+        gap = (
+            f"; the largest spot that was not measured is {self.gap_mm:.2g} mm across, at"
+            f" {_format_place(self.gap_place)}"
+            if self.gap_mm and self.gap_place
+            else ""
+        )
+        return (
+            f"{self.area:.1f} % of the area that the views can see was measured, where an error"
+            f" beyond the tolerance over a spot of {self.spot_mm:.2g} mm is seen{gap}."
+        )
+
+
+def _format_place(place: Vector) -> str:
+    """Return a place in the nominal's frame in words."""
+    return f"x y z {' '.join(f'{x:.1f}' for x in place)} mm of the model"
+
+
+def _describe_place(each: DeviatingPlace) -> str:
+    """Return what is wrong at a place in words."""
+    value = f"{each.value_mm:+.3f}".replace("-", "−")
+    return f"{value} ± {each.U_mm:.3f} mm, {PLACE_KINDS[each.kind]}, at {_format_place(each.place)}"
 
 
 class NominalDeviation(msgspec.Struct, frozen=True):
     """Signed distances of a scan from a nominal model after the best fit, positive outside it.
 
-    ``noise_mm``: RMS of the scan's noise alone along the nominal's normals; points farther than
-    ``reach_mm`` belong to something else; ``coverage``: share of the nominal's area that was
-    measured; ``alignment_mm``: standard uncertainty that the best fit adds to a point.
+    ``noise_mm``: RMS of the scan's noise alone along the nominal's normals; ``reach_mm``: points
+    nearer count in the best fit; ``excluded``: those that are not the part; ``coverage``: share of
+    the nominal's area that was measured; ``alignment_mm``: standard uncertainty that the best fit
+    adds to a point.
     """
 
     nominal: NominalModel
@@ -189,6 +279,7 @@ class NominalDeviation(msgspec.Struct, frozen=True):
     alignment_mm: float
     T_nominal_scan: Matrix4
     verdict: ToleranceVerdict | None = None
+    excluded: tuple[ExcludedPoints, ...] = ()
 
     @property
     def tolerance_mm(self) -> float | None:
@@ -225,14 +316,17 @@ class NominalDeviation(msgspec.Struct, frozen=True):
             figures.append(Quantity("RMS of the scan's noise alone", self.noise_mm, "mm"))
         decisions: dict[str, Cell] = {}
         if verdict is not None:
-            for end, (_, decision) in (("lower", verdict.lowest), ("upper", verdict.highest)):
-                decided = Cell(DECIDED[decision], MARKS[decision])
-                decisions[f"range of 99.7 %, {end} end"] = decided
+            for name_of_end, (value, decision) in (
+                ("least local mean", verdict.lowest),
+                ("largest local mean", verdict.highest),
+            ):
+                decisions[name_of_end] = Cell(DECIDED[decision], MARKS[decision])
+                figures.append(Quantity(name_of_end, value, "mm"))
             figures += [
                 Quantity("inside by more than U", verdict.inside, "%"),
                 Quantity("too close to tell", verdict.close, "%"),
                 Quantity("outside by more than U", verdict.outside, "%"),
-                Quantity("U of a point, k = 2", verdict.U_mm, "mm"),
+                Quantity("U of a local mean, k = 2", verdict.U_mm, "mm"),
             ]
             if verdict.area is not None:
                 figures.append(Quantity("visible area measured", verdict.area, "%"))
@@ -246,6 +340,7 @@ class NominalDeviation(msgspec.Struct, frozen=True):
             for each in figures
         ]
         share = 100 * numbers.left_out / max(numbers.points + numbers.left_out, 1)
+        excluded = "; ".join(each.text() for each in self.excluded) or "none is excluded"
         size = (
             ""
             if nominal.size_mm is None
@@ -256,14 +351,32 @@ class NominalDeviation(msgspec.Struct, frozen=True):
             f"{source} against {nominal.name}{triangles}{size}.",
             *(f"{nominal.name}: {note}." for note in nominal.notes),
             (
-                f"{numbers.points:,} points; {numbers.left_out:,} ({share:.1f} %) lie farther than"
-                f" {self.reach_mm:.3g} mm from the nominal or face another way, and are excluded."
-                f" The best fit adds {self.alignment_mm:.4f} mm (1 sigma)."
+                f"{numbers.points:,} points; {numbers.left_out:,} ({share:.1f} %) are not taken for"
+                f" the part: {excluded}. The best fit adds {self.alignment_mm:.4f} mm (1 sigma)."
             ),
             *(f"{warning}." for warning in warnings),
             *([] if verdict is None else [f"{verdict.text()}. It is {RULE}."]),
+            *([] if verdict is None else filter(None, [verdict.describe_evidence()])),
         ]
         return Table.of(rows, f"Deviation from nominal: {name}", notes).without_empty()
+
+    def list_places(self, name: str) -> Table:
+        """Return the table of the places out of tolerance."""
+        rows = [
+            {
+                "what": PLACE_KINDS[each.kind],
+                Column("deviation", "mm"): each.value_mm,
+                Column("U (k=2)", "mm"): each.U_mm,
+                Column("x", "mm", digits=1): each.place[0],
+                Column("y", "mm", digits=1): each.place[1],
+                Column("z", "mm", digits=1): each.place[2],
+                Column("across", "mm", digits=1): each.across_mm,
+                "points": each.points,
+            }
+            for each in (() if self.verdict is None else self.verdict.places)
+        ]
+        notes = ["Each at its worst place, in the frame of the model."]
+        return Table.of(rows, f"Out of tolerance: {name}", notes)
 
 
 class Measurement(Record, frozen=True, kw_only=True):
@@ -399,11 +512,12 @@ class Measurement(Record, frozen=True, kw_only=True):
         model."""
         measured = {name: each for name, each in found.items() if each.deviation is None}
         tables = [list_quantities(measured)] if measured else []
-        return tables + [
-            each.deviation.table(name, each.source, each.warnings)
-            for name, each in found.items()
-            if each.deviation is not None
-        ]
+        for name, each in found.items():
+            if (deviation := each.deviation) is not None:
+                tables.append(deviation.table(name, each.source, each.warnings))
+                if deviation.verdict is not None and deviation.verdict.places:
+                    tables.append(deviation.list_places(name))
+        return tables
 
 
 def _settings_of_comparison(meta: Mapping[str, Any]) -> dict[str, Any]:

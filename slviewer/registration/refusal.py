@@ -25,3 +25,11 @@ class Refused(SlviewerError):
     def with_context(self, context: str) -> "Refused":
         """Return a copy of the error with a sentence put in front of its message."""
         return Refused(self.reason, f"{context} {self}")
+
+
+class WrongPart(Refused):
+    """A scan that fits another model by far better than the nominal one: its mirror image, or the
+    model at another scale, as the message says."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("disagree", message)

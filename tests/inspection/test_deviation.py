@@ -14,9 +14,9 @@ from slviewer.inspection.deviation import (
     colour_limit,
     deviation,
     deviation_colours,
-    judge_deviation,
 )
 from slviewer.inspection.nominal_surface import NominalSurface
+from slviewer.inspection.tolerance import judge_deviation
 from slviewer.records.measurement import ToleranceVerdict
 from slviewer.records.record import from_plain, to_plain
 from slviewer.registration.refusal import Refused

@@ -5,10 +5,10 @@ import pytest
 from facts import raises
 
 from slviewer.errors import InputError
-from slviewer.inspection.deviation import judge_limits
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
+from slviewer.inspection.tolerance import judge_limits
 from slviewer.records.measurement import Quantity
 from slviewer.validation.prove_plan import CASES
 

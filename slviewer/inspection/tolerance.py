@@ -1,0 +1,319 @@
+"""Whether a part stays within a tolerance of its nominal model, as far as the uncertainty of its
+deviations lets one say.
+
+A tolerance holds for the surface, not for the noise of single points. The deviations are therefore
+averaged over as many neighbours as bring the mean's uncertainty well below the tolerance, and every
+such local mean is judged; a few points in one place weigh as much as a whole side.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats, distance_jacobian
+from slviewer.geometry.vectors import occupied_cubes
+from slviewer.inspection.deviation import Deviation
+from slviewer.inspection.exclusion import label_clusters
+from slviewer.records.acceptance import COVERAGE, Decision, worst_decision
+from slviewer.records.measurement import LEAST_AREA, DeviatingPlace, PlaceKind, ToleranceVerdict
+from slviewer.records.record import to_vector
+from slviewer.surface.shapes import extent_across
+
+MEAN_SHARE = 0.19
+"""Of the tolerance: so many points are averaged that the expanded uncertainty of their mean is no
+larger. Larger means hide small errors, smaller ones exceed the tolerance by noise."""
+LEAST_POINTS, MOST_POINTS = 6, 64
+"""Averaged in a local mean."""
+WIDER = 4
+"""Times as many points are averaged where that shows an error more clearly."""
+FAIL_SIGMAS = 3.0
+"""Standard deviations by which a local mean fails: there are hundreds of them."""
+MOST_MEANS = 60_000
+"""Points of larger scans are combined first."""
+FACE = 3.0
+"""Ratio of the distance that two sides of a thin wall are apart in a search for neighbours, to the
+radius of a mean."""
+MIN_PLACE = 3
+MOST_PLACES = 20
+MOST_ALONE = 0.02
+"""Share of isolated points, above which the scan is too bad to pass."""
+LARGEST_GAP = 0.05
+"""Diameter of the largest spot without points that may pass, of the nominal's diagonal; not where
+the operator wants a verdict on a smaller area."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Deviations ``value`` (n,) mm of points, or of several combined (``count``), where they lie,
+    in the nominal's frame, how they face, and their standard deviations of noise and, common to
+    neighbours, of calibration and alignment."""
+
+    place: Floats
+    facing: Floats
+    value: Floats
+    noise: Floats
+    common: Floats
+    is_unmatched: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+
+@dataclass(frozen=True, eq=False)
+class _Means:
+    """Local means (n,) mm of deviations, their standard deviations, and the radius (n,) mm."""
+
+    value: Floats
+    sigma: Floats
+    radius: Floats
+
+    def beyond(self, tolerance: float, sigmas: float = FAIL_SIGMAS) -> Floats:
+        """By how much (n,) mm a mean exceeds the tolerance in spite of its uncertainty."""
+        return np.abs(self.value) - sigmas * self.sigma - tolerance
+
+
+def judge_deviation(
+    deviation: Deviation,
+    sigma_mm: Floats,
+    tolerance_mm: float,
+    least_area: float = LEAST_AREA,
+    common_mm: Floats | None = None,
+    reason: str = "",
+) -> ToleranceVerdict:
+    """Decide whether a part stays within plus and minus a tolerance.
+
+    ``sigma_mm`` (n,): noise of the points along the surface's normal, and ``common_mm`` (n,) what
+    neighbours share, from the calibration. ``least_area``: percent of the visible area that a pass
+    needs. ``reason``: why the scan does not show this part, which fails it.
+    """
+    if not tolerance_mm > 0:
+        raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
+    points = _list_points(deviation, sigma_mm, common_mm)
+    count = float(np.median(points.noise) / tolerance_mm)
+    needed = int(np.clip((COVERAGE * count / MEAN_SHARE) ** 2, LEAST_POINTS, MOST_POINTS))
+    means = _average(points, needed)
+    places = _list_places(deviation, points, means, needed, tolerance_mm)
+    U = COVERAGE * means.sigma
+    off = np.abs(means.value)
+    inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
+    ends = [_judge_end(means, int(end), tolerance_mm) for end in _ends(means.value)]
+    area = deviation.area.percent_measured() or 0.0
+    spot = 2 * float(np.percentile(means.radius, 95))
+    gap, gap_place = deviation.area.largest_gap
+    doubts = list(_list_doubts(deviation, area, least_area, gap))
+    if places or reason:
+        decision: Decision = "fail"
+    else:
+        decision = worst_decision({ends[0][1], ends[1][1], *(["undecided"] if doubts else [])})  # type: ignore[arg-type]
+    signed = deviation.signed[deviation.counted]
+    return ToleranceVerdict(
+        tolerance_mm,
+        float(np.median(U)),
+        ends[0],
+        ends[1],
+        decision,
+        100 * float(np.mean(np.abs(signed) <= tolerance_mm)),
+        100 * float(inside.mean()),
+        100 * float(outside.mean()),
+        100 * float(np.mean(~inside & ~outside)),
+        area,
+        least_area,
+        places,
+        spot,
+        gap,
+        to_vector(gap_place) if gap else None,
+        reason,
+        tuple(doubts),
+    )
+
+
+def judge_limits(value: float, U: float, lower: float | None, upper: float | None) -> Decision:
+    """Decide by guard bands whether a value of expanded uncertainty U (k = 2) lies between limits,
+    of which one may be absent: "pass" inside both by U, "fail" beyond one by more than U, else
+    "undecided"."""
+    low, high = (-np.inf if lower is None else lower), (np.inf if upper is None else upper)
+    if not (np.isfinite(value) and np.isfinite(U)):
+        return "undecided"
+    if low + U <= value <= high - U:
+        return "pass"
+    return "fail" if value < low - U or value > high + U else "undecided"
+
+
+def _ends(values: Floats) -> tuple[np.intp, np.intp]:
+    return np.argmin(values), np.argmax(values)
+
+
+def _judge_end(means: _Means, end: int, tolerance: float) -> tuple[float, Decision]:
+    """Return a local mean and its decision."""
+    value, sigma = float(means.value[end]), float(means.sigma[end])
+    if abs(value) - FAIL_SIGMAS * sigma > tolerance:
+        return value, "fail"
+    is_inside = abs(value) + COVERAGE * sigma <= tolerance
+    return value, "pass" if is_inside else "undecided"
+
+
+def _list_points(deviation: Deviation, sigma_mm: Floats, common_mm: Floats | None) -> _Points:
+    """Return the deviations of a scan, combined to at most about `MOST_MEANS`."""
+    T, counted = deviation.T_nominal_scan, deviation.counted
+    places, normals = deviation.located[counted], deviation.normals[counted] @ T[:3, :3].T
+    own = deviation.facing
+    facing = normals if own is None else np.where(np.isfinite(own[counted]), own[counted], normals)
+    value = deviation.signed[counted].astype(np.float64)
+    noise = np.maximum(np.nan_to_num(sigma_mm[counted]).astype(np.float64), deviation.noise_mm)
+    common = np.zeros(len(value)) if common_mm is None else np.nan_to_num(common_mm[counted])
+    spread = deviation.alignment_spread
+    J = distance_jacobian(places - spread.centre, normals.astype(np.float64))
+    aligned = np.einsum("ni,ij,nj->n", J, spread.covariance, J)
+    common = np.sqrt(common.astype(np.float64) ** 2 + aligned)
+    unmatched = deviation.is_unmatched[counted]
+    points = _Points(places, facing, value, noise, common, unmatched)
+    if len(points) <= MOST_MEANS:
+        return points
+    return _combine(points, deviation.area.spacing_mm * np.sqrt(len(points) / MOST_MEANS) / 3)
+
+
+def _combine(points: _Points, side: float) -> _Points:
+    """Return the means of points by cubes of ``side`` mm, and by the way that they face."""
+    axis = np.argmax(np.abs(points.facing), axis=1)
+    faces = 2 * axis + (np.take_along_axis(points.facing, axis[:, None], 1)[:, 0] > 0)
+    apart = 2 * float(np.ptp(points.place, axis=0).max()) + 2 * side
+    keyed = points.place + np.outer(faces, [apart, 0, 0])
+    _, which = occupied_cubes(keyed, side)
+    count = np.bincount(which)
+
+    def mean(values: Floats) -> Floats:
+        return np.bincount(which, values) / count
+
+    return _Points(
+        np.stack([mean(column) for column in points.place.T], axis=1),
+        np.stack([mean(column) for column in points.facing.T], axis=1),
+        mean(points.value),
+        mean(points.noise) / np.sqrt(count),
+        mean(points.common),
+        mean(points.is_unmatched.astype(np.float64)) > 0.5,
+    )
+
+
+def _average(points: _Points, count: int, chosen: np.ndarray | None = None) -> _Means:
+    """Return the mean of each of the ``chosen`` points, or of all, and its nearest neighbours that
+    face alike, ``count`` in all, of which the largest and the least do not count: spikes."""
+    count = min(count, len(points))
+    radius = _median_radius(points, count)
+    keyed = np.hstack([points.place, FACE * radius * points.facing])
+    asked = keyed if chosen is None else keyed[chosen]
+    distance, near = cKDTree(keyed).query(asked, k=count, workers=-1)
+    distance, near = distance.reshape(len(asked), count), near.reshape(len(asked), count)
+    order = np.argsort(points.value[near], axis=1)
+    near = np.take_along_axis(near, order, axis=1)
+    trimmed = near[:, 1:-1]
+    value = points.value[trimmed].mean(axis=1)
+    noise = np.sqrt(np.mean(points.noise[near] ** 2, axis=1) / count)
+    # what the deviation changes by within the mean, beyond noise
+    varies = np.maximum(
+        points.value[trimmed].var(axis=1) - np.mean(points.noise[near] ** 2, axis=1), 0.0
+    )
+    sigma = np.sqrt(noise**2 + points.common[near].mean(axis=1) ** 2 + varies / count)
+    return _Means(value, sigma, distance.max(axis=1))
+
+
+def _median_radius(points: _Points, count: int) -> float:
+    """Return the median radius in mm that holds ``count`` points."""
+    some = points.place[:: max(1, len(points) // 2000)]
+    return float(np.median(cKDTree(points.place).query(some, k=count)[0].max(axis=-1)))
+
+
+def _list_places(
+    deviation: Deviation, points: _Points, means: _Means, count: int, tolerance: float
+) -> tuple[DeviatingPlace, ...]:
+    """Return the connected areas out of tolerance, the worst first."""
+    suspect = np.flatnonzero(np.abs(means.value) > 0.8 * tolerance)
+    if len(suspect) and WIDER * count < len(points):
+        wide = _average(points, WIDER * count, suspect)
+        is_better = wide.beyond(0.0) > _take(means, suspect).beyond(0.0)
+        value, sigma = means.value.copy(), means.sigma.copy()
+        value[suspect[is_better]] = wide.value[is_better]
+        sigma[suspect[is_better]] = wide.sigma[is_better]
+        means = _Means(value, sigma, means.radius)
+    area, link = deviation.area, max(deviation.area.spacing_mm, float(np.median(means.radius)))
+    found = list[DeviatingPlace]()
+    missing = np.flatnonzero(np.abs(np.nan_to_num(area.deviation)) > tolerance + area.spacing_mm)
+    out = means.beyond(tolerance) > 0
+    for sign in (-1, 1):
+        own = np.flatnonzero(out & (np.sign(means.value) == sign))
+        samples = missing[np.sign(area.deviation[missing]) == sign]
+        together = np.concatenate([points.place[own], area.counterpart[samples]])
+        for members in label_clusters(together, link):
+            if len(members) < MIN_PLACE:
+                continue
+            measured, places = own[members[members < len(own)]], members[members >= len(own)]
+            found.append(_describe(points, means, measured, deviation, samples[places - len(own)]))
+    found.sort(key=lambda each: -abs(each.value_mm))
+    return tuple(found[:MOST_PLACES])
+
+
+def _take(means: _Means, chosen: np.ndarray) -> _Means:
+    return _Means(means.value[chosen], means.sigma[chosen], means.radius[chosen])
+
+
+def _describe(
+    points: _Points,
+    means: _Means,
+    measured: np.ndarray,
+    deviation: Deviation,
+    samples: np.ndarray,
+) -> DeviatingPlace:
+    """Return an area out of tolerance from the ``measured`` means and the ``samples`` of the
+    nominal in it."""
+    area = deviation.area
+    worst, sigma, place = 0.0, 0.0, np.zeros(3)
+    if len(measured):
+        bounds = means.beyond(0.0)[measured]
+        first = measured[int(np.argmax(bounds))]
+        worst, sigma, place = means.value[first], means.sigma[first], points.place[first]
+    if len(samples):
+        extreme = samples[int(np.argmax(np.abs(area.deviation[samples])))]
+        if abs(area.deviation[extreme]) > abs(worst) + area.spacing_mm:
+            worst, place = area.deviation[extreme], area.places[extreme]
+            sigma = area.spacing_mm / 2
+    is_unmatched = len(samples) > 0 or bool(points.is_unmatched[measured].mean() > 0.5)
+    kinds: tuple[PlaceKind, PlaceKind] = ("excess", "missing") if is_unmatched else ("high", "low")
+    extent = np.concatenate([points.place[measured], area.places[samples]])
+    return DeviatingPlace(
+        kinds[0 if worst > 0 else 1],
+        to_vector(place),
+        float(worst),
+        COVERAGE * float(sigma),
+        extent_across(extent),
+        len(measured),
+    )
+
+
+def _list_doubts(deviation: Deviation, area: float, least_area: float, gap: float) -> Iterator[str]:
+    """Yield what keeps a scan from passing although no place of it is out of tolerance."""
+    if area < least_area:
+        yield (
+            f"{area:.1f} % of the area that the views can see was measured, and {least_area:g} %"
+            " are needed: see that the scan shows this part, scan what is missing and merge"
+        )
+    most = max(3 * deviation.area.spacing_mm, LARGEST_GAP * deviation.surface.diagonal)
+    if area >= least_area >= LEAST_AREA and gap > most:
+        place = " ".join(f"{x:.1f}" for x in deviation.area.largest_gap[1])
+        yield (
+            f"a spot of {gap:.2g} mm at x y z {place} mm of the model was not measured, and could"
+            " hide an error: scan it too and merge"
+        )
+    alone = sum(each.points for each in deviation.excluded if each.reason == "alone")
+    if alone > MOST_ALONE * len(deviation.signed):
+        yield (
+            f"{100 * alone / len(deviation.signed):.1f} % of the points are isolated: scan again"
+            " with more light"
+        )
+    for each in deviation.excluded:
+        if each.reason == "touching":
+            yield (
+                f"{each.text()} is not in the model: exclude it by the region of interest if it is"
+                " not the part's"
+            )
