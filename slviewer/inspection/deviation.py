@@ -36,8 +36,11 @@ ROBUST_SIGMAS, ROBUST_STEP, ROBUST_ROUNDS = 4.685, 0.8, 4
 """Of the deviations' robust standard deviation: points beyond do not count in the best fit, so that
 the error of one feature does not spread over the part. The fit is repeated where that brings the
 limit down to this share of the last."""
-RAY_NEIGHBOURS = 4
-"""Points about a ray that must all lie behind a place for it to be missing."""
+MIN_GAP_COSINE = 0.3
+"""Between a normal and the way from a place on the nominal to where the part is instead."""
+RAY_NEIGHBOURS, LEAST_ON_RAY, RAY_SPACINGS = 24, 6, 1.5
+"""Points about a ray, of which at least six must be there, and all lie behind a place that is
+missing; and their distance from it over that which most neighbours keep threefold."""
 COVERAGE_SAMPLES = 20_000
 MIN_SEEN_COSINE = 0.45
 """Of a place on the nominal that a view can measure: at more oblique ones points are few."""
@@ -215,7 +218,7 @@ def deviation(
         points, normals, surface, T, reach_mm, lambda share: report(0.6 + 0.2 * share)
     )
     report(0.8)
-    scan = _locate(points, normals, surface, T, sigma_mm or 0.0)
+    scan = _locate(points, normals, surface, T, reach_mm, sigma_mm or 0.0)
     placed_views = [move_points(T, centres) for centres in views or ()]
     found = classify_points(scan, surface, reach_mm, placed_views)
     counted = np.isfinite(found.signed)
@@ -247,7 +250,12 @@ def deviation(
 
 
 def _locate(
-    points: Floats, normals: Floats | None, surface: NominalSurface, T: Floats, noise: float
+    points: Floats,
+    normals: Floats | None,
+    surface: NominalSurface,
+    T: Floats,
+    reach: float,
+    noise: float,
 ) -> LocatedPoints:
     """Return the scan's points at its pose ``T`` (4, 4), with their places on the nominal."""
     moved = move_points(T, points)
@@ -259,7 +267,7 @@ def _locate(
     spacing = SPACINGS * float(np.percentile(gaps[:, 1], 95))
     # form hardly differs between neighbours
     ends = subsample(away, MAX_FEET)[pairs]
-    steps = np.diff(ends[np.isfinite(ends).all(axis=1)], axis=1)
+    steps = np.diff(ends[(np.abs(ends) <= reach).all(axis=1)], axis=1)
     noise = max(noise, robust_sigma(steps, about=0.0) / np.sqrt(2)) if len(steps) else noise
     turned = None if normals is None else normals @ T[:3, :3].T
     return LocatedPoints(moved, turned, away, towards, spacing, noise)
@@ -319,20 +327,12 @@ def _measure_area(
         part = cKDTree(subsample(scan.points[matched], MAX_FEET))
         deviates = near <= part.query(places[open_places], workers=-1)[0]
         chosen, which = open_places[deviates], far[which[deviates]]
-        offsets = scan.points[which] - places[chosen]
-        across = np.abs(np.einsum("ij,ij->i", offsets, facing[chosen]))
-        distance = lengths(offsets)  # beside a short one, the points' spacing counts
-        value = np.where(distance > 2 * scan.spacing_mm, distance, across)
-        sign = np.where(found.signed[which] < 0, -1.0, 1.0)
-        if scan.normals is not None:  # a place in the open is missing
-            height = np.einsum("ij,ij->i", offsets, scan.normals[which])
-            sign = np.where(np.isfinite(height), np.sign(height), sign)
-        deviation[chosen], counterpart[chosen] = sign * value, scan.points[which]
+        value = _across_gap(scan, which, places[chosen], facing[chosen], surface)
+        deviation[chosen], counterpart[chosen] = value, scan.points[which]
     if len(views) == 1 and len(open_places):
-        passed = open_places[is_visible[open_places]]
-        depth = _depth_behind(scan, places[passed], views[0][0])
-        through = passed[depth > scan.spacing_mm]
-        deviation[through] = -np.fmax(np.abs(deviation[through]), depth[depth > scan.spacing_mm])
+        passed = open_places[is_visible[open_places] & np.isnan(deviation[open_places])]
+        passed = passed[_lie_before(scan, places[passed], views[0][0])]
+        deviation[passed] = -cKDTree(scan.points).query(places[passed], workers=-1)[0]
     return NominalArea(
         places,
         measured | np.isfinite(deviation),
@@ -344,24 +344,42 @@ def _measure_area(
     )
 
 
-def _depth_behind(scan: LocatedPoints, places: Floats, camera: Floats) -> Floats:
-    """Return by how much (n,) mm the scan's points about the ray from the ``camera`` (3,) to each
-    place (n, 3) lie behind it, all of them; 0 where some do not, or none is near."""
-    if not len(places):
-        return np.zeros(0)
+def _across_gap(
+    scan: LocatedPoints, which: np.ndarray, places: Floats, facing: Floats, surface: NominalSurface
+) -> Floats:
+    """Return how far (n,) mm the part is from places (n, 3) on the nominal, facing (n, 3), that the
+    scan shows at its points ``which`` (n,) instead: positive where these lie outside; NaN where
+    they do not, as behind a wall."""
+    offsets = scan.points[which] - places
+    distance = lengths(offsets)
+    height = np.einsum("ij,ij->i", offsets, facing)
+    is_opposite = np.abs(height) > MIN_GAP_COSINE * distance
+    if scan.normals is not None:
+        own = np.einsum("ij,ij->i", offsets, scan.normals[which])
+        # outside the nominal there is material below the point, inside it air above
+        is_opposite &= ~(np.sign(height) * own < MIN_GAP_COSINE * distance)
+    is_opposite &= ~surface.is_between(places, scan.points[which])
+    # beside a short distance, the points' spacing counts
+    value = np.sign(height) * np.where(distance > 2 * scan.spacing_mm, distance, np.abs(height))
+    return np.where(is_opposite, value, np.nan)
+
+
+def _lie_before(scan: LocatedPoints, places: Floats, camera: Floats) -> Mask:
+    """Return which places (n, 3) the rays of a ``camera`` (3,) pass through, as the scan's points
+    about them show: some are near the ray, and all of these lie behind the place."""
     rays = scan.points - camera
     if scan.normals is not None:  # what faces away was seen from elsewhere
         rays = rays[~(np.einsum("ij,ij->i", rays, scan.normals) > 0)]
-    depth = lengths(rays)
-    wanted = places - camera
-    distance = lengths(wanted)
+    depth, distance = lengths(rays), lengths(places - camera)
     tree = cKDTree(rays / depth[:, None], balanced_tree=False, compact_nodes=False)
-    limit = scan.spacing_mm / float(np.median(depth))
-    _, which = tree.query(
-        wanted / distance[:, None], k=RAY_NEIGHBOURS, distance_upper_bound=limit, workers=-1
+    _, near = tree.query(
+        (places - camera) / distance[:, None],
+        k=RAY_NEIGHBOURS,
+        distance_upper_bound=RAY_SPACINGS * scan.spacing_mm / float(np.median(depth)),
+        workers=-1,
     )
-    behind = np.append(depth, -np.inf)[which] - distance[:, None]
-    return np.maximum(behind.min(axis=1), 0.0)
+    is_behind = np.append(depth, np.inf)[near] > distance[:, None] + scan.spacing_mm
+    return np.asarray(is_behind.all(axis=1) & (near[:, LEAST_ON_RAY - 1] < len(depth)))
 
 
 EXCLUDED_COLOUR = (150, 154, 160)

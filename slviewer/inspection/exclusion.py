@@ -34,6 +34,8 @@ of the part."""
 BURR = 0.1
 """Of the nominal's diagonal: something smaller that touches the part beside its footprint is the
 part's own, a burr or dirt; something larger may be a clamp."""
+CONTACT = 0.5
+"""Of the spacing that most neighbours of a scan keep threefold: what is nearer touches."""
 MAX_CONTACT_POINTS = 200_000
 
 
@@ -95,16 +97,18 @@ def classify_points(
     beyond = far[np.isinf(signed[far])]
     signed[beyond] = surface.gaps(scan.points[beyond])
     is_inside = (signed[far] < 0) | ((facing[far] < -MIN_NORMAL_COSINE) & (gap[far] <= reach))
-    if not surface.is_closed:
-        is_inside &= _is_over(scan, far, surface, views, outwards=True)
     excluded = list[ExcludedPoints]()
     foreign = list[np.ndarray]()
+    # an open model has no underside: a table that is seen through its holes lies behind it
+    beside = np.ones(len(far), bool) if not surface.is_closed else ~is_inside
+    for plane in _list_tables(scan.points[far[beside]], surface, scan):
+        on_plane = beside & (np.abs(plane.distance(scan.points[far])) <= _plane_tolerance(scan))
+        foreign.append(far[on_plane])
+        excluded.append(_describe("table", scan.points[far[on_plane]]))
+        far, is_inside, beside = far[~on_plane], is_inside[~on_plane], beside[~on_plane]
+    if not surface.is_closed:
+        is_inside &= _is_over(scan, far, surface, views, outwards=True)
     outside = far[~is_inside]
-    for plane in _list_tables(scan.points[outside], surface, scan):
-        on_plane = np.abs(plane.distance(scan.points[outside])) <= _plane_tolerance(scan)
-        foreign.append(outside[on_plane])
-        excluded.append(_describe("table", scan.points[outside[on_plane]]))
-        outside = outside[~on_plane]
     rest = np.concatenate([far[is_inside], outside])
     inside_count = int(is_inside.sum())
     part = cKDTree(subsample(scan.points[is_near], MAX_CONTACT_POINTS)) if is_near.any() else None
@@ -120,7 +124,7 @@ def classify_points(
             continue
         places = scan.points[cluster]
         is_attached = part is not None and bool(
-            (part.query(subsample(places, 20_000), workers=-1)[0] <= scan.spacing_mm).any()
+            (part.query(subsample(places, 20_000))[0] <= CONTACT * scan.spacing_mm).any()
         )
         if is_attached and extent_across(places) < BURR * surface.diagonal:
             continue

@@ -1,6 +1,6 @@
 """A nominal model: signed distances of points from it, and initial alignment of a scan to it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
@@ -49,6 +49,8 @@ NEGLIGIBLE = 1e-4
 MIN_NORMAL_COSINE = 0.5
 """Cosine: a scan point whose normal is turned away further from the nominal's lies on something
 else there."""
+CHUNK = 32_768
+MAX_VOTERS = 200_000
 LEAST_VOTES = 20
 """Points more that show a patch from behind, from which on it faces the wrong way."""
 
@@ -92,9 +94,24 @@ class NominalSurface:
         rays = np.concatenate([origins - self.middle, directions], axis=1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy(), bool)
 
+    def is_between(self, starts: Floats, ends: Floats) -> Mask:
+        """Return whether the surface lies between places (n, 3), (n, 3), but not at them: (n,)
+        bool."""
+        rays = np.concatenate([starts - self.middle, ends - starts], axis=1).astype(np.float32)
+        near = open3d().core.Tensor(rays)
+        return np.asarray(self._scene.test_occlusions(near, 0.01, 0.99).numpy(), bool)
+
     def signed(self, points: Floats) -> tuple[Floats, Floats]:
         """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open
         mesh; and the surface's normals (n, 3) where each is nearest."""
+        away, normals = np.empty(len(points)), np.empty((len(points), 3))
+        for k in range(0, len(points), CHUNK):  # that the caches hold
+            each = slice(k, k + CHUNK)
+            away[each], normals[each] = self._signed(points[each])
+        return away, normals
+
+    def _signed(self, points: Floats) -> tuple[Floats, Floats]:
+        """`signed` of fewer points."""
         centred = points - self.middle
         nearest = self._scene.compute_closest_points(
             open3d().core.Tensor(centred.astype(np.float32))
@@ -157,6 +174,7 @@ class NominalSurface:
         """Return which triangles (m,) bool face away from a scan's points (n, 3), with normals
         (n, 3), at ``T`` (4, 4): of patches that are wound alike, those that most of the points
         within ``reach`` mm show from behind."""
+        points, normals = subsample(points, MAX_VOTERS), subsample(normals, MAX_VOTERS)
         pairs, alike = list_adjacent_faces(self._faces)
         patch = label_connected(pairs[alike], len(self._faces))
         moved = (move_points(T, points) - self.middle).astype(np.float32)
@@ -285,12 +303,13 @@ def search_pose(
     sigma_mm: float | None,
     report: Progress,
     has_camera: bool = True,
+    views: Sequence[Floats] = VIEWS,
 ) -> Floats:
     """The pose (4, 4), T_nominal_scan, of a scan's points (n, 3) mm; the nominal's triangles may
     face either way.
 
     A scan that ``has_camera`` shows one side of a part: poses are searched on what a camera sees of
-    the nominal from each of `VIEWS` (on all of it first without), and fitted to all of it, until
+    the nominal from each of the ``views`` (on all of it first without), and fitted to all of it, until
     one fits well; else the one of least cost is taken. Among the poses of a symmetric part the
     choice does not change the deviations. Raises ``Refused`` where the best does not fit, or the
     shape does not hold it.
@@ -302,7 +321,7 @@ def search_pose(
     few_normals = None if normals is None else subsample(normals, FITTED_POINTS)
     best: NominalPose | None = None
     score, in_vain = 0.0, 0
-    for side, camera in _list_sides(surface, has_camera, report):
+    for side, camera in _list_sides(surface, has_camera, views, report):
         starts = search_starts(scan, side, min(scan.size, side.size))
         score, in_vain = max(score, starts[0].score), in_vain + 1
         for start in starts:
@@ -314,7 +333,8 @@ def search_pose(
                 if best is None or pose.cost < best.cost:
                     in_vain = 0 if best is None or pose.cost < BETTER_COST * best.cost else in_vain
                     best = pose
-        if best is not None and (best.is_good or (best.is_likely and in_vain >= PATIENCE)):
+        patience = PATIENCE if has_camera else 2
+        if best is not None and (best.is_good or (best.is_likely and in_vain >= patience)):
             break
     if best is None:
         raise Refused(
@@ -335,15 +355,15 @@ def search_pose(
 
 
 def _list_sides(
-    surface: NominalSurface, has_camera: bool, report: Progress
+    surface: NominalSurface, has_camera: bool, views: Sequence[Floats], report: Progress
 ) -> Iterator[tuple[PreparedScan, Floats]]:
-    """Yield what a camera sees of the nominal from each of `VIEWS`, and its centre (3,) mm; first
+    """Yield what a camera sees of the nominal from each of the ``views``, and its centre (3,) mm; first
     all of it, from the origin, for a scan without camera."""
     places, facing = surface.sample(SAMPLES)
     if not has_camera:
         yield prepare_scan("nominal model", places, facing, has_camera=False), np.zeros(3)
-    for turn, view in enumerate(VIEWS):
-        report(turn / len(VIEWS))
+    for turn, view in enumerate(views):
+        report(turn / len(views))
         towards = np.where(facing @ view < 0, -1.0, 1.0)[:, None] * facing
         visible = surface.seen_from(places, towards, view, MIN_FACING_COSINE)
         if np.count_nonzero(visible) >= MIN_VISIBLE:

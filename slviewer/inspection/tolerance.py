@@ -64,11 +64,17 @@ class _Points:
 
 @dataclass(frozen=True, eq=False)
 class _Means:
-    """Local means (n,) mm of deviations, their standard deviations, and the radius (n,) mm."""
+    """Local means (n,) mm of deviations, their standard deviations, the radius (n,) mm, and the
+    standard deviation (n,) mm of the deviations in it beyond noise."""
 
     value: Floats
     sigma: Floats
     radius: Floats
+    variation: Floats
+
+    def take(self, chosen: np.ndarray) -> "_Means":
+        """Return some of the means."""
+        return _Means(**{name: values[chosen] for name, values in vars(self).items()})
 
     def beyond(self, tolerance: float, sigmas: float = FAIL_SIGMAS) -> Floats:
         """By how much (n,) mm a mean exceeds the tolerance in spite of its uncertainty."""
@@ -213,10 +219,10 @@ def _average(points: _Points, count: int, chosen: np.ndarray | None = None) -> _
     noise = np.sqrt(np.mean(points.noise[near] ** 2, axis=1) / count)
     # what the deviation changes by within the mean, beyond noise
     varies = np.maximum(
-        points.value[trimmed].var(axis=1) - np.mean(points.noise[near] ** 2, axis=1), 0.0
+        points.value[near].var(axis=1) - np.mean(points.noise[near] ** 2, axis=1), 0.0
     )
     sigma = np.sqrt(noise**2 + points.common[near].mean(axis=1) ** 2 + varies / count)
-    return _Means(value, sigma, distance.max(axis=1))
+    return _Means(value, sigma, distance.max(axis=1), np.sqrt(varies))
 
 
 def _median_radius(points: _Points, count: int) -> float:
@@ -232,11 +238,8 @@ def _list_places(
     suspect = np.flatnonzero(np.abs(means.value) > 0.8 * tolerance)
     if len(suspect) and WIDER * count < len(points):
         wide = _average(points, WIDER * count, suspect)
-        is_better = wide.beyond(0.0) > _take(means, suspect).beyond(0.0)
-        value, sigma = means.value.copy(), means.sigma.copy()
-        value[suspect[is_better]] = wide.value[is_better]
-        sigma[suspect[is_better]] = wide.sigma[is_better]
-        means = _Means(value, sigma, means.radius)
+        is_better = wide.beyond(0.0) > means.take(suspect).beyond(0.0)
+        means = _replace(means, suspect[is_better], wide.take(is_better))
     area, link = deviation.area, max(deviation.area.spacing_mm, float(np.median(means.radius)))
     found = list[DeviatingPlace]()
     missing = np.flatnonzero(np.abs(np.nan_to_num(area.deviation)) > tolerance + area.spacing_mm)
@@ -254,8 +257,12 @@ def _list_places(
     return tuple(found[:MOST_PLACES])
 
 
-def _take(means: _Means, chosen: np.ndarray) -> _Means:
-    return _Means(means.value[chosen], means.sigma[chosen], means.radius[chosen])
+def _replace(means: _Means, which: np.ndarray, others: _Means) -> _Means:
+    """Return means of which some (k,) are replaced."""
+    fields = {name: values.copy() for name, values in vars(means).items()}
+    for name, values in fields.items():
+        values[which] = getattr(others, name)
+    return _Means(**fields)
 
 
 def _describe(
@@ -272,7 +279,9 @@ def _describe(
     if len(measured):
         bounds = means.beyond(0.0)[measured]
         first = measured[int(np.argmax(bounds))]
-        worst, sigma, place = means.value[first], means.sigma[first], points.place[first]
+        worst, place = means.value[first], points.place[first]
+        # what is averaged may be larger at its worst
+        sigma = np.hypot(means.sigma[first], means.variation[first])
     if len(samples):
         extreme = samples[int(np.argmax(np.abs(area.deviation[samples])))]
         if abs(area.deviation[extreme]) > abs(worst) + area.spacing_mm:

@@ -9,8 +9,8 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, distance_jacobian, move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.vectors import diagonal, rms_length, subsample
-from slviewer.inspection.nominal_surface import NominalSurface, search_pose
+from slviewer.geometry.vectors import diagonal, rms_length, subsample, unit_vectors
+from slviewer.inspection.nominal_surface import VIEWS, NominalSurface, search_pose
 from slviewer.registration.refusal import Refused
 from slviewer.surface.shapes import Mesh
 
@@ -29,6 +29,8 @@ UNITS = {
 }
 MATCHING = 1.5
 """Ratio of two sizes that may be one."""
+NEAREST_VIEWS = 8
+"""From which a mirror image is looked at."""
 SCALE_STEPS, SCALE_SIGMAS = 12, 5.0
 
 Report = Callable[[float], None]
@@ -55,6 +57,12 @@ def explain_misfit(
     if off < LEAST_OFF:
         return ""
     most = min(BETTER * off, MOST_OFF)
+    views = VIEWS
+    if T is not None:  # its pose on the model says roughly from where it is seen
+        seen = np.abs(unit_vectors(T[:3, 3] - surface.middle))
+        views = sorted(VIEWS, key=lambda view: -float(np.abs(view) @ seen))[
+            : NEAREST_VIEWS if has_camera else 0
+        ]
     if T is not None:
         scale, sigma = _fit_scale(points, normals, surface, T, near_mm)
         scaled = NominalSurface(_scale(nominal, scale, surface.middle))
@@ -70,7 +78,7 @@ def explain_misfit(
     for words, mesh, factor in _list_others(nominal, points, surface.diagonal):
         other, near = NominalSurface(mesh), factor * near_mm
         with suppress(Refused, InputError):
-            pose = search_pose(points, normals, other, near / 4, _ignore, has_camera)
+            pose = search_pose(points, normals, other, near / 4, _ignore, has_camera, views)
             share = _share_off(points, normals, other, _refit(points, normals, other, pose), near)
             if share < most:
                 return (
