@@ -15,7 +15,7 @@ from slviewer.errors import SlviewerError
 from slviewer.evaluation.render import Row
 from slviewer.inspection.deviation import deviation, judge_deviation
 from slviewer.pipeline.operation import Progress
-from slviewer.simulation.part_cases import CaseSetup, PartCase, make_case, plan_cases
+from slviewer.validation.part_cases import CaseSetup, PartCase, make_case, plan_cases
 from slviewer.validation.proof import BandCheck, Proof, prove_checks
 
 CASES, PROCESSES = 1200, 2
@@ -92,17 +92,17 @@ class JudgedCase:
             return "FALSE PASS" if self.in_view else "not in view"
         if self.expected == "pass" and self.verdict == "fail":
             return "FALSE FAIL"
+        if self.is_place_right is False:
+            return "wrong place"
+        if self.is_value_right is False:
+            return "wrong value"
         return "right" if self.verdict == self.expected else self.verdict
 
     def text(self) -> str:
         """The case in one line, with the expression that repeats it."""
-        s = self.setup
-        named = f"; named {', '.join(self.kinds)}" if self.kinds else ""
-        return (
-            f"{self.outcome}: {s.kind}, {s.fault}, {s.size:g} tolerances, {s.view}, {s.clutter},"
-            f" {s.source}: {100 * self.seen:.0f} % of the fault seen, {self.evidence} points"
-            f"{named}{self.message and ': '}{self.message} [judge_case({s!r})]"
-        )
+        shown = f"{100 * self.seen:.0f} % of the fault and {self.evidence} points of it seen"
+        named = f"named {', '.join(self.kinds) or 'nothing'}"
+        return f"{self.outcome}: judge_case({self.setup!r}): {shown}, {named}. {self.message}"
 
 
 def judge_case(setup: CaseSetup) -> JudgedCase:
@@ -114,12 +114,9 @@ def judge_case(setup: CaseSetup) -> JudgedCase:
     is_place_right = is_value_right = None
     is_true_fail = setup.expected == answer.verdict == "fail"
     if is_true_fail and len(answer.places) and setup.fault not in FIGURELESS:
-        near = case.within_changed(answer.places[0])
-        off = case.changed_mm[near] - answer.values_mm[0]
-        is_place_right = bool(near.any())
-        is_value_right = is_place_right and bool(
-            off.min() <= answer.U_mm[0] and off.max() >= -answer.U_mm[0]
-        )
+        off, U = case.changed_near(answer.places[0]) - answer.values_mm[0], answer.U_mm[0]
+        is_place_right = len(off) > 0
+        is_value_right = is_place_right and bool(off.min() <= U and off.max() >= -U)
     return JudgedCase(
         setup,
         answer.verdict,
@@ -155,36 +152,16 @@ def summarize_parts(cases: Sequence[JudgedCase], scale: float) -> Proof:
     wrong = [c for c in cases if c.expected == "fail"]
     full = [c for c in cases if c.setup.view == "full" and (c.in_view or c.expected == "pass")]
     named = [c for c in wrong if c.verdict == "fail" and c.setup.fault not in FIGURELESS]
+    false_fails = _share(right, lambda c: c.outcome == "FALSE FAIL")
+    open_cases = _share(full, lambda c: c.verdict in ("undecided", "refused"))
+    places = _share(named, lambda c: bool(c.is_place_right))
+    values = _share(named, lambda c: bool(c.is_value_right))
     checks = [
         BandCheck("wrong parts", "number of false passes", _count(wrong, "FALSE PASS"), 0, 0),
-        BandCheck(
-            "right parts",
-            "share of false fails",
-            _share(right, lambda c: c.outcome == "FALSE FAIL"),
-            0,
-            MAX_FALSE_FAILS,
-        ),
-        BandCheck(
-            "full views",
-            "share that is undecided or refused",
-            _share(full, lambda c: c.verdict in ("undecided", "refused")),
-            0,
-            MAX_UNDECIDED,
-        ),
-        BandCheck(
-            "true fails",
-            "share whose named place lies within the fault",
-            _share(named, lambda c: bool(c.is_place_right)),
-            MIN_NAMED,
-            1,
-        ),
-        BandCheck(
-            "true fails",
-            "share whose value is within its uncertainty",
-            _share(named, lambda c: bool(c.is_value_right)),
-            MIN_NAMED,
-            1,
-        ),
+        BandCheck("right parts", "share of false fails", false_fails, 0, MAX_FALSE_FAILS),
+        BandCheck("full views", "share without a decision", open_cases, 0, MAX_UNDECIDED),
+        BandCheck("true fails", "share with a place in the fault", places, MIN_NAMED, 1),
+        BandCheck("true fails", "share with a value within its U", values, MIN_NAMED, 1),
     ]
     rows = list(_list_rows(cases))
     seconds = np.quantile([c.seconds for c in cases], [0.5, 0.95])
