@@ -12,6 +12,7 @@ from slviewer.validation.prove_captures import prove_captures
 from slviewer.validation.prove_causes import prove_causes
 from slviewer.validation.prove_guidance import prove_guidance
 from slviewer.validation.prove_hostile import prove_hostile
+from slviewer.validation.prove_parts import prove_parts
 from slviewer.validation.prove_plan import prove_plan
 from slviewer.validation.prove_registration import prove_registration
 from slviewer.validation.prove_reports import prove_reports
@@ -24,6 +25,7 @@ Claim = Literal[
     "edges",
     "guidance",
     "hostile",
+    "parts",
     "plan",
     "registration",
     "reports",
@@ -53,6 +55,7 @@ CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "edges": ("printed edges without ridges", prove_edges),
     "guidance": ("guided poses", prove_guidance),
     "hostile": ("captures of a hostile rig", prove_hostile),
+    "parts": ("verdicts on parts", prove_parts),
     "plan": ("tolerances of an inspection plan", prove_plan),
     "registration": ("scans in one frame", prove_registration),
     "reports": ("reported situations", prove_reports),
@@ -108,9 +111,9 @@ def prove(
         quick: A quarter of the camera's resolution; its figures are its own.
         only: What to prove: accuracy on planes and spheres, two cameras, causes of bad
             calibrations and captures, printed edges, guidance of an operator to good poses,
-            captures of a hostile rig, tolerances of an inspection plan, registration of scans,
-            reported situations, surfaces that light themselves, uncertainty against true errors; by
-            default all.
+            captures of a hostile rig, verdicts on right and wrong parts, tolerances of an
+            inspection plan, registration of scans, reported situations, surfaces that light
+            themselves, uncertainty against true errors; by default all.
         cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or
             gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.

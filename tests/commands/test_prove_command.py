@@ -56,6 +56,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
         "edges": True,
         "guidance": True,
         "hostile": True,
+        "parts": True,
         "plan": True,
         "registration": True,
         "reports": True,

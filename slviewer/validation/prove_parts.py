@@ -1,0 +1,207 @@
+"""Whether verdicts on parts are true: no wrong part passes, no right part fails, and what is named
+lies where the part is wrong."""
+
+import multiprocessing
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from time import perf_counter
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from slviewer.errors import SlviewerError
+from slviewer.evaluation.render import Row
+from slviewer.inspection.deviation import deviation, judge_deviation
+from slviewer.pipeline.operation import Progress
+from slviewer.validation.part_cases import CaseSetup, PartCase, make_case, plan_cases
+from slviewer.validation.proof import BandCheck, Proof, prove_checks
+
+CASES, PROCESSES = 1200, 2
+"""Of a full run."""
+MAX_FALSE_FAILS, MAX_UNDECIDED, MIN_NAMED = 0.005, 0.02, 0.95
+FIGURELESS = ("mirrored", "scaled")
+"""Faults of the whole part that their name describes, not a place."""
+
+Verdict = Literal["pass", "fail", "undecided", "refused"]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A verdict on a part; ``places`` (k, 3) mm that it names in the nominal's frame, with their
+    values and uncertainties mm, (k,) each, and ``kinds``; ``message`` of a refusal."""
+
+    verdict: Verdict
+    places: np.ndarray
+    values_mm: np.ndarray
+    U_mm: np.ndarray
+    kinds: tuple[str, ...] = ()
+    message: str = ""
+
+
+def judge_scan(case: PartCase) -> Answer:
+    """The program's verdict on a scan of a part."""
+    none = np.empty((0, 3)), np.empty(0), np.empty(0)
+    try:
+        result = deviation(
+            case.points,
+            case.nominal,
+            normals=case.normals,
+            sigma_mm=float(np.median(case.sigma_mm)),
+            views=case.views,
+        )
+        verdict = judge_deviation(result, case.sigma_mm, case.tolerance_mm)
+    except SlviewerError as error:
+        return Answer("refused", *none, message=str(error))
+    named: Sequence[Any] = getattr(verdict, "places", ())
+    return Answer(
+        verdict.decision,
+        np.array([p.place for p in named]).reshape(-1, 3),
+        np.array([p.value_mm for p in named], float),
+        np.array([p.U_mm for p in named], float),
+        tuple(str(p.kind) for p in named),
+    )
+
+
+@dataclass(frozen=True)
+class JudgedCase:
+    """A case and the verdict on it. ``is_place_right``, ``is_value_right``: of the first place of a
+    true fail; None where there is none. ``seen``, ``evidence``, ``in_view`` as in `PartCase`."""
+
+    setup: CaseSetup
+    verdict: Verdict
+    in_view: bool
+    seen: float
+    evidence: int
+    is_place_right: bool | None
+    is_value_right: bool | None
+    kinds: tuple[str, ...]
+    message: str
+    seconds: float
+
+    @property
+    def expected(self) -> Verdict:
+        """The true verdict."""
+        return self.setup.expected
+
+    @property
+    def outcome(self) -> str:
+        """The verdict against the truth."""
+        if self.expected == "fail" and self.verdict == "pass":
+            return "FALSE PASS" if self.in_view else "not in view"
+        if self.expected == "pass" and self.verdict == "fail":
+            return "FALSE FAIL"
+        if self.is_place_right is False:
+            return "wrong place"
+        if self.is_value_right is False:
+            return "wrong value"
+        return "right" if self.verdict == self.expected else self.verdict
+
+    def text(self) -> str:
+        """The case in one line, with the expression that repeats it."""
+        shown = f"{100 * self.seen:.0f} % of the fault and {self.evidence} points of it seen"
+        named = f"named {', '.join(self.kinds) or 'nothing'}"
+        return f"{self.outcome}: judge_case({self.setup!r}): {shown}, {named}. {self.message}"
+
+
+def judge_case(setup: CaseSetup) -> JudgedCase:
+    """Make a case and judge it."""
+    case = make_case(setup)
+    start = perf_counter()
+    answer = judge_scan(case)
+    seconds = perf_counter() - start
+    is_place_right = is_value_right = None
+    is_true_fail = setup.expected == answer.verdict == "fail"
+    if is_true_fail and len(answer.places) and setup.fault not in FIGURELESS:
+        off, U = case.changed_near(answer.places[0]) - answer.values_mm[0], answer.U_mm[0]
+        is_place_right = len(off) > 0
+        is_value_right = is_place_right and bool(off.min() <= U and off.max() >= -U)
+    return JudgedCase(
+        setup,
+        answer.verdict,
+        case.in_view,
+        case.seen,
+        case.evidence,
+        is_place_right,
+        is_value_right,
+        answer.kinds,
+        answer.message,
+        seconds,
+    )
+
+
+def prove_parts(scale: float, seed: int, progress: Progress) -> Proof:
+    """Judge scans of right and wrong parts, and count the verdicts.
+
+    ``scale``: share of the cases of a full run.
+    """
+    setups = plan_cases(max(1, round(scale * CASES)), seed)
+    cases: list[JudgedCase] = []
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(PROCESSES, spawn) as pool:
+        for case in pool.map(judge_case, setups, chunksize=4):
+            cases.append(case)
+            progress(len(cases) / len(setups), f"{case.setup.kind}, {case.setup.fault}")
+    return summarize_parts(cases, scale)
+
+
+def summarize_parts(cases: Sequence[JudgedCase], scale: float) -> Proof:
+    """The table of verdicts by fault and by size, and the shares that must lie within bounds."""
+    right = [c for c in cases if c.expected == "pass"]
+    wrong = [c for c in cases if c.expected == "fail"]
+    full = [c for c in cases if c.setup.view == "full" and (c.in_view or c.expected == "pass")]
+    named = [c for c in wrong if c.verdict == "fail" and c.setup.fault not in FIGURELESS]
+    false_fails = _share(right, lambda c: c.outcome == "FALSE FAIL")
+    open_cases = _share(full, lambda c: c.verdict in ("undecided", "refused"))
+    places = _share(named, lambda c: bool(c.is_place_right))
+    values = _share(named, lambda c: bool(c.is_value_right))
+    checks = [
+        BandCheck("wrong parts", "number of false passes", _count(wrong, "FALSE PASS"), 0, 0),
+        BandCheck("right parts", "share of false fails", false_fails, 0, MAX_FALSE_FAILS),
+        BandCheck("full views", "share without a decision", open_cases, 0, MAX_UNDECIDED),
+        BandCheck("true fails", "share with a place in the fault", places, MIN_NAMED, 1),
+        BandCheck("true fails", "share with a value within its U", values, MIN_NAMED, 1),
+    ]
+    rows = list(_list_rows(cases))
+    seconds = np.quantile([c.seconds for c in cases], [0.5, 0.95])
+    total = Counter(c.outcome for c in cases)
+    lines = [
+        f"{len(cases)} cases: " + ", ".join(f"{n} {name}" for name, n in total.most_common()),
+        f"{seconds[0]:.2f} s to judge in the median, {seconds[1]:.2f} s in 95 %",
+        *(c.text() for c in cases if c.outcome != "right"),
+    ]
+    record = {"cases": [asdict(c) | {"outcome": c.outcome} for c in cases]}
+    return prove_checks(checks, scale, rows, record, below=lines)
+
+
+def _count(cases: Sequence[JudgedCase], outcome: str) -> int:
+    """Number of cases of an outcome."""
+    return sum(c.outcome == outcome for c in cases)
+
+
+def _share(cases: Sequence[JudgedCase], holds: Callable[[JudgedCase], bool]) -> float:
+    """Share of the cases for which something holds; NaN without cases."""
+    return sum(map(holds, cases)) / len(cases) if cases else float("nan")
+
+
+def _list_rows(cases: Sequence[JudgedCase]) -> Iterator[Row]:
+    """Yield the verdicts on right parts, then of each fault of wrong ones, then of each size."""
+    right = [c for c in cases if c.expected == "pass"]
+    wrong = [c for c in cases if c.expected == "fail"]
+    groups = {"right parts": right, "wrong parts": wrong}
+    for fault in sorted({c.setup.fault for c in cases}):
+        groups[fault] = [c for c in (wrong if fault != "none" else right) if c.setup.fault == fault]
+    for size in sorted({c.setup.size for c in cases}):
+        groups[f"{size:g} tolerances"] = [c for c in cases if c.setup.size == size]
+    for view in sorted({c.setup.view for c in cases}):
+        groups[view] = [c for c in cases if c.setup.view == view]
+    for name, own in groups.items():
+        verdicts = Counter(c.verdict for c in own)
+        yield {
+            "cases": name,
+            **{verdict: verdicts[verdict] for verdict in get_args(Verdict)},
+            "false pass": _count(own, "FALSE PASS"),
+            "false fail": _count(own, "FALSE FAIL"),
+            "not in view": _count(own, "not in view"),
+        }
