@@ -269,19 +269,21 @@ def _describe(
     points: _Points,
     means: _Means,
     measured: np.ndarray,
+    count: int,
     deviation: Deviation,
     samples: np.ndarray,
 ) -> DeviatingPlace:
-    """Return an area out of tolerance from the ``measured`` means and the ``samples`` of the
-    nominal in it."""
+    """Return an area out of tolerance from the ``measured`` means, of ``count`` points each, and
+    the ``samples`` of the nominal in it."""
     area = deviation.area
     worst, sigma, place = 0.0, 0.0, np.zeros(3)
     if len(measured):
         bounds = means.beyond(0.0)[measured]
         first = measured[int(np.argmax(bounds))]
         worst, place = means.value[first], points.place[first]
-        # what is averaged may be larger at its worst
-        sigma = np.hypot(means.sigma[first], means.variation[first])
+        # the largest of several means is too large by noise; what one averages has a larger peak
+        chosen = np.sqrt(1 + 2 * np.log(max(1.0, len(measured) / count)))
+        sigma = np.hypot(chosen * means.sigma[first], means.variation[first])
     if len(samples):
         extreme = samples[int(np.argmax(np.abs(area.deviation[samples])))]
         if abs(area.deviation[extreme]) > abs(worst) + area.spacing_mm:

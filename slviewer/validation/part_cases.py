@@ -260,7 +260,10 @@ def _solve_deformation(
     J = distance_jacobian(points, normals)
     off = (_list_monomials(points) @ field.T * normals).sum(axis=1)
     motion = np.linalg.lstsq(J, off, rcond=None)[0]
-    amount = size_mm / float(np.abs(off - J @ motion).max())
+    largest = float(np.abs(off - J @ motion).max())
+    if not largest > 1e-9 * float(np.abs(off).max()):
+        raise UnsuitedPartError("the deformation moves its surfaces along themselves")
+    amount = size_mm / largest
 
     def deform(places: Floats) -> Floats:
         T = turn_about(-amount * motion[:3], np.zeros(3), -amount * motion[3:])

@@ -13,8 +13,14 @@ import numpy as np
 
 from slviewer.errors import SlviewerError
 from slviewer.evaluation.render import Row
-from slviewer.inspection.deviation import deviation, judge_deviation
+from slviewer.geometry.rigid import move_points
+from slviewer.inspection.deviation import Deviation, deviation
+from slviewer.inspection.exclusion import NOISE
+from slviewer.inspection.tolerance import judge_deviation
+from slviewer.inspection.wrong_part import explain_misfit
 from slviewer.pipeline.operation import Progress
+from slviewer.registration.refusal import WrongPart
+from slviewer.simulation.parts import UnsuitedPartError
 from slviewer.validation.part_cases import CaseSetup, PartCase, make_case, plan_cases
 from slviewer.validation.proof import BandCheck, Proof, prove_checks
 
@@ -30,19 +36,22 @@ Verdict = Literal["pass", "fail", "undecided", "refused"]
 @dataclass(frozen=True)
 class Answer:
     """A verdict on a part; ``places`` (k, 3) mm that it names in the nominal's frame, with their
-    values and uncertainties mm, (k,) each, and ``kinds``; ``message`` of a refusal."""
+    values and uncertainties mm, (k,) each, and ``kinds``; ``message``: other reasons.
+    ``shifts_mm`` (k,): what the best fit adds to the deviations there, by its difference from the
+    true pose."""
 
     verdict: Verdict
     places: np.ndarray
     values_mm: np.ndarray
     U_mm: np.ndarray
+    shifts_mm: np.ndarray
     kinds: tuple[str, ...] = ()
     message: str = ""
 
 
 def judge_scan(case: PartCase) -> Answer:
     """The program's verdict on a scan of a part."""
-    none = np.empty((0, 3)), np.empty(0), np.empty(0)
+    none = np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0)
     try:
         result = deviation(
             case.points,
@@ -52,15 +61,34 @@ def judge_scan(case: PartCase) -> Answer:
             views=case.views,
         )
         verdict = judge_deviation(result, case.sigma_mm, case.tolerance_mm)
+        if verdict.decision != "pass":
+            verdict = verdict.of_other_part(_explain(case, result))
+    except WrongPart as error:
+        return Answer("fail", *none, message=str(error))
     except SlviewerError as error:
         return Answer("refused", *none, message=str(error))
-    named: Sequence[Any] = getattr(verdict, "places", ())
+    places = np.array([each.place for each in verdict.places]).reshape(-1, 3)
+    moved = move_points(result.T_nominal_scan @ np.linalg.inv(case.T_nominal_scan), places)
     return Answer(
         verdict.decision,
-        np.array([p.place for p in named]).reshape(-1, 3),
-        np.array([p.value_mm for p in named], float),
-        np.array([p.U_mm for p in named], float),
-        tuple(str(p.kind) for p in named),
+        places,
+        np.array([each.value_mm for each in verdict.places]),
+        np.array([each.U_mm for each in verdict.places]),
+        np.einsum("ij,ij->i", moved - places, result.surface.signed(places)[1]),
+        tuple(each.kind for each in verdict.places),
+        verdict.reason or "; ".join(verdict.doubts),
+    )
+
+
+def _explain(case: PartCase, result: Deviation) -> str:
+    """What other part a scan shows, in words."""
+    return explain_misfit(
+        case.points[result.counted],
+        case.normals[result.counted],
+        case.nominal,
+        result.T_nominal_scan,
+        max(case.tolerance_mm, NOISE * result.noise_mm),
+        case.views is not None,
     )
 
 
@@ -92,6 +120,8 @@ class JudgedCase:
             return "FALSE PASS" if self.in_view else "not in view"
         if self.expected == "pass" and self.verdict == "fail":
             return "FALSE FAIL"
+        if self.expected == "pass" and self.setup.clutter == "touching clamp":
+            return "right"  # nothing but the operator can tell it from the part
         if self.is_place_right is False:
             return "wrong place"
         if self.is_value_right is False:
@@ -105,16 +135,20 @@ class JudgedCase:
         return f"{self.outcome}: judge_case({self.setup!r}): {shown}, {named}. {self.message}"
 
 
-def judge_case(setup: CaseSetup) -> JudgedCase:
-    """Make a case and judge it."""
-    case = make_case(setup)
+def judge_case(setup: CaseSetup) -> JudgedCase | None:
+    """Make a case and judge it; None where no part suits its fault."""
+    try:
+        case = make_case(setup)
+    except UnsuitedPartError:
+        return None
     start = perf_counter()
     answer = judge_scan(case)
     seconds = perf_counter() - start
     is_place_right = is_value_right = None
     is_true_fail = setup.expected == answer.verdict == "fail"
     if is_true_fail and len(answer.places) and setup.fault not in FIGURELESS:
-        off, U = case.changed_near(answer.places[0]) - answer.values_mm[0], answer.U_mm[0]
+        value = answer.values_mm[0] - answer.shifts_mm[0]
+        off, U = case.changed_near(answer.places[0]) - value, answer.U_mm[0]
         is_place_right = len(off) > 0
         is_value_right = is_place_right and bool(off.min() <= U and off.max() >= -U)
     return JudgedCase(
@@ -140,9 +174,12 @@ def prove_parts(scale: float, seed: int, progress: Progress) -> Proof:
     cases: list[JudgedCase] = []
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(PROCESSES, spawn) as pool:
-        for case in pool.map(judge_case, setups, chunksize=4):
-            cases.append(case)
-            progress(len(cases) / len(setups), f"{case.setup.kind}, {case.setup.fault}")
+        for k, (setup, case) in enumerate(
+            zip(setups, pool.map(judge_case, setups, chunksize=4), strict=True)
+        ):
+            progress(k / len(setups), f"{setup.kind}, {setup.fault}")
+            if case is not None:
+                cases.append(case)
     return summarize_parts(cases, scale)
 
 
