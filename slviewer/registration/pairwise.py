@@ -1,8 +1,9 @@
 """Pairwise registration: point-to-plane ICP, coarse to fine, with checks of the result.
 
 A registration is refused, with the reason, unless the surfaces agree where they face each other,
-enough of the scan overlaps, the shape of the overlap determines all six degrees of freedom (a plane
-slides on a plane, a sphere turns in a sphere), and no other pose fits as well.
+enough of the scan overlaps, the shape of the overlap or a small feature on it determines all six
+degrees of freedom (a plane slides on a plane, a sphere turns in a sphere), and no other pose fits
+as well.
 """
 
 from collections.abc import Callable
@@ -37,7 +38,7 @@ LEAST_OVERLAP = 0.15
 LEAST_AGREEMENT = 0.8
 MOST_ATTEMPTS = 3
 MOST_SLACK = 1 / 30  # of the object's size
-_SLIGHT = 0.1
+_SLIGHT = 0.2
 """Share of that slack from which a small feature holds the pose better than all points do."""
 LEAST_MARKERS = 2
 """In common, without overlap: of one alone nobody could tell that it was moved."""
@@ -96,8 +97,8 @@ def register_prepared(
     what the shape leaves open; alone, where the surfaces do not overlap. ``progress`` receives the
     share of the work done, 0 to 1, and may raise to cancel.
 
-    Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not
-    hold the pose, or where a second pose fits alike, between which a given start does not decide.
+    Raises ``Refused`` where nothing aligns, where too little overlaps, where neither the shape nor
+    a small feature holds the pose, or where a second pose fits alike, between which a given start does not decide.
     """
     if markers is not None:
         progress(0.4)
@@ -116,9 +117,10 @@ def register_prepared(
             refusal = error
             if error.reason not in WORDS:
                 continue
-        limit = MOST_SLACK * size * (1.0 if refusal is not None else _SLIGHT)
-        if freedom.loosest_mm > limit:
-            held = _hold_by_feature(scan, reference, result, freedom.loose_motions(limit), size, given)
+        limit = MOST_SLACK * size
+        if freedom.loosest_mm > _SLIGHT * limit:
+            loose = freedom.loose_motions(min(limit, freedom.loosest_mm))
+            held = _hold_by_feature(scan, reference, result, loose, size, given)
             if held is not None:
                 progress(1.0)
                 return held

@@ -269,9 +269,7 @@ class LooseMotions:
     def move(self, amounts: Floats) -> Floats:
         """Return the motion (4, 4) by amounts (r + s,) mm."""
         count = len(self.turns)
-        return turn_about(
-            amounts[:count] @ self.turns, self.centre, amounts[count:] @ self.shifts
-        )
+        return turn_about(amounts[:count] @ self.turns, self.centre, amounts[count:] @ self.shifts)
 
     def twists(self, centre: Floats) -> Floats:
         """Return (r + s, 6): rotations about ``centre`` (3,) mm, rad, and translations, mm."""

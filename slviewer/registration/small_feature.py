@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from slviewer.geometry.rigid import Floats, Uncertainty, move_points, turn_about
-from slviewer.geometry.vectors import lengths, subsample, occupied_cubes, unit_vectors
+from slviewer.geometry.vectors import lengths, occupied_cubes, subsample, unit_vectors
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.refine import LooseMotions, RefinedPose, refine_pose
 from slviewer.registration.scan import PreparedScan
@@ -34,13 +33,13 @@ _ALIKE = 0.85
 _NEIGHBOURS, _OF_NORMALS = 6, 10
 _SURVEYED = (1 / 16, 1 / 8, 1 / 4, 1 / 2) * 3
 """Motions along which misfit is surveyed, over the object's size."""
+_LEAST_SURVEYED = 3
 _MOST_POINTS, _TARGETS = 40_000, 40
 _PROBES, _SPUN_PROBES = 10, 2
 _SPIN_DEG = 15
 _BEST = 6
-DEBUG=0
 _UNSEEN = 1.25
-"""A feature's points count in both directions, and neighbours share counterparts."""
+"""Ratio of true to estimated sigma, as in ``refine``."""
 
 
 class _Surface:
@@ -52,12 +51,14 @@ class _Surface:
         self.points, self.tree = scan.fine_points, scan.fine_tree
         self.normals = np.asarray(cloud.normals)
 
-    def distances(self, points: Floats, reach: float) -> Floats:
-        """Return the mean distances (...) mm of points (..., 3) along the normals of their
-        neighbours, at most ``reach``; NaN beyond the rim."""
+    def distances(self, points: Floats, normals: Floats, reach: float) -> Floats:
+        """Return the mean distances (...) mm of points (..., 3) from their neighbours along the
+        mean of both normals, at most ``reach``; NaN beyond the rim."""
         away, near = self.tree.query(points, _NEIGHBOURS)
         gaps = points[..., None, :] - self.points[near]
-        height = np.sum(gaps * self.normals[near], axis=-1).mean(axis=-1)
+        both, own = self.normals[near], normals[..., None, :]
+        both = unit_vectors(both + own * np.sign(np.sum(both * own, axis=-1, keepdims=True)))
+        height = np.sum(gaps * both, axis=-1).mean(axis=-1)
         # the neighbours of a point beyond the rim lie on one side of it
         across, farthest = (
             np.maximum(each**2 - height**2, 0.0)
@@ -68,12 +69,27 @@ class _Surface:
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """The feature's points (n, 3) mm of one scan, and their squared misfit (n,) mm² where the other
-    scan does not show it."""
+    """The feature's points and normals (n, 3) of one scan, and their squared misfit (n,) mm² where
+    the other scan does not show it."""
 
     points: Floats
+    normals: Floats
     misfit: Floats
-    other: "_Surface"
+    other: _Surface
+
+    def distances(self, T: Floats, reach: float) -> Floats:
+        """Return the distances (..., n) mm from the other scan at poses (..., 4, 4)."""
+        normals = self.normals @ np.swapaxes(T[..., :3, :3], -1, -2)
+        return self.other.distances(move_points(T, self.points), normals, reach)
+
+    def select(self, which: np.ndarray | slice) -> "_Side":
+        """Return some of the points."""
+        return replace(
+            self,
+            points=self.points[which],
+            normals=self.normals[which],
+            misfit=self.misfit[which],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +112,8 @@ class _Feature:
     def distances(self, poses: Floats) -> Floats:
         """Return distances (..., n) mm of the points of both scans at poses (..., 4, 4); NaN beyond
         the rim."""
-        sides = (self.scan, poses), (self.reference, np.linalg.inv(poses))
-        return np.concatenate(
-            [
-                side.other.distances(move_points(T, side.points), self.reach)
-                for side, T in sides
-            ],
-            axis=-1,
-        )
+        sides = (self.scan, poses), (self.reference, np.asarray(np.linalg.inv(poses), float))
+        return np.concatenate([side.distances(T, self.reach) for side, T in sides], axis=-1)
 
     def gains(self, poses: Floats) -> Floats:
         """Return how much of the misfit vanishes (...) mm² at poses (..., 4, 4)."""
@@ -120,7 +130,7 @@ class _Feature:
     def thinned(self, most: int) -> "_Feature":
         """The feature with at most so many points of each scan."""
         scan, reference = (
-            replace(side, points=subsample(side.points, most), misfit=subsample(side.misfit, most))
+            side.select(np.s_[:: -(-len(side.points) // most)])
             for side in (self.scan, self.reference)
         )
         return replace(self, scan=scan, reference=reference)
@@ -141,13 +151,16 @@ def hold_by_feature(
     """
 
     def tighten(T: Floats) -> RefinedPose:
+        """Refine a pose without its loose motions."""
         return refine_pose(scan, reference, T, pose.gate_mm, pose.gate_mm, loose=loose)
 
     amounts = np.random.default_rng(0).normal(size=(len(_SURVEYED), loose.count))
     amounts = size * np.array(_SURVEYED)[:, None] * unit_vectors(amounts)
     surveyed = [tighten(loose.move(each) @ pose.T) for each in amounts]
     poses = np.array([each.T for each in surveyed if np.isfinite(each.uncertainty.shift_mm)])
-    feature = _detect_feature(scan, reference, poses, 2.0 * pose.gate_mm)
+    feature = None
+    if loose.count <= 3 and len(poses) >= _LEAST_SURVEYED:
+        feature = _detect_feature(scan, reference, poses, 2.0 * pose.gate_mm)
     if feature is None:
         return []
     bases = [pose.T, *(tighten(T).T for T in _flip(scan, pose.T, loose))]
@@ -160,7 +173,6 @@ def hold_by_feature(
         solutions.append((float(feature.gains(T)), replace(refined, T=T)))
     solutions.sort(key=lambda each: -each[0])
     best, held = solutions[0]
-    if DEBUG: print("gains",[round(g/feature.misfit.sum(),3) for g,_ in solutions])
     uncertainty = _estimate_uncertainty(feature, held, loose, width, size)
     if uncertainty is None:
         return []
@@ -175,32 +187,31 @@ def _detect_feature(
     """Return the points that do not fit at most of the ``poses`` (m, 4, 4), which differ by loose
     motions; None where too few do."""
     found = []
-    for own, onto, T in (
-        (scan, reference, poses),
-        (reference, scan, np.linalg.inv(poses)),
-    ):
-        other = _Surface(onto)
-        points = subsample(own.fine_points, _MOST_POINTS)
-        squares = [other.distances(move_points(each, points), reach) ** 2 for each in T]
-        is_seen = np.count_nonzero(np.isfinite(squares), axis=0) >= 3
+    surfaces = _Surface(scan), _Surface(reference)
+    both_ways = poses, np.linalg.inv(poses)
+    for own, other, T in zip(surfaces, surfaces[::-1], both_ways, strict=True):
+        points, normals = (subsample(each, _MOST_POINTS) for each in (own.points, own.normals))
+        side = _Side(points, normals, np.zeros(len(points)), other)
+        squares = np.array([side.distances(each, reach) ** 2 for each in T])
+        is_seen = np.count_nonzero(np.isfinite(squares), axis=0) >= _LEAST_SURVEYED
         if np.count_nonzero(is_seen) < _LEAST_POINTS:
             return None
-        misfit = np.nanmedian(np.array(squares)[:, is_seen], axis=0)
-        found.append(_Side(points[is_seen], misfit, other))
+        side.misfit[is_seen] = np.nanmedian(squares[:, is_seen], axis=0)
+        found.append(side.select(is_seen))
     sigma = float(1.4826 * np.sqrt(np.median(np.concatenate([side.misfit for side in found]))))
     smooth = []
     for side in found:
         near = cKDTree(side.points).query(side.points, _NEIGHBOURS + 1)[1]
         smooth.append(np.median(side.misfit[near], axis=1))
     sides = []
-    for k, T in enumerate((poses, np.linalg.inv(poses))):
+    for k, T in enumerate(both_ways):
         shown = np.flatnonzero(smooth[k] > (_DEPTH * sigma) ** 2)
         # along edges of the shape all points fit badly
         landed = cKDTree(found[1 - k].points).query(move_points(T, found[k].points[shown]))[1]
         shown = shown[smooth[k][shown] > _ABOVE * np.median(smooth[1 - k][landed], axis=0)]
         if len(shown) < _LEAST_POINTS:
             return None
-        sides.append(replace(found[k], points=found[k].points[shown], misfit=found[k].misfit[shown]))
+        sides.append(found[k].select(shown))
     return _Feature(sides[0], sides[1], sigma, reach)
 
 
@@ -237,7 +248,6 @@ def _list_candidates(feature: _Feature, bases: list[Floats], loose: LooseMotions
     gains = np.concatenate(
         [few.gains(each) for each in np.array_split(poses, 1 + len(poses) // 1000)]
     )
-    if DEBUG: print("candidates",len(poses),"gain",gains.max()/few.misfit.sum(), len(feature.scan.points),len(feature.reference.points),"sigma",feature.sigma, "loose",loose.turns*loose.radius,loose.shifts,loose.centre)
     chosen: list[Floats] = []
     apart = 0.1 * loose.radius
     for k in np.argsort(-gains):
@@ -277,7 +287,7 @@ def _settle(feature: _Feature, T: Floats, loose: LooseMotions, width: float) -> 
         for _ in range(8):
             distances = np.nan_to_num(feature.distances(T))
             J = feature.jacobian(T, loose, step)
-            amounts = -np.linalg.lstsq(J, distances, rcond=1e-3)[0]
+            amounts: Floats = np.asarray(-np.linalg.lstsq(J, distances, rcond=1e-3)[0], float)
             length = float(lengths(amounts))
             T = loose.move(amounts * min(1.0, step / max(length, 1e-9))) @ T
             if length < 0.01 * step:
@@ -295,12 +305,6 @@ def _estimate_uncertainty(
     if not gain > _EXPLAINED * feature.misfit[is_seen].sum():
         return None
     J = feature.jacobian(T, loose, width)
-    if DEBUG:
-        for motion in _MOTION * size * np.linalg.eigh(J.T @ J)[1].T:
-            ends = np.stack([loose.move(sign * motion) @ T for sign in (1, -1)])
-            print("rise", (gain-feature.gains(ends))/feature.sigma**2, np.sqrt(2.0 * np.count_nonzero(is_seen)))
-        gp=np.linalg.pinv(J) * np.nan_to_num(distances)
-        print("error", np.sqrt(np.trace(4*gp@gp.T)), MOST_ERROR*size)
     least = (_RISE + 5.0 * np.sqrt(2.0 * np.count_nonzero(is_seen))) * feature.sigma**2
     for motion in _MOTION * size * np.linalg.eigh(J.T @ J)[1].T:
         ends = np.stack([loose.move(sign * motion) @ T for sign in (1, -1)])
@@ -311,7 +315,6 @@ def _estimate_uncertainty(
     count = len(occupied_cubes(points, 2.0 * width)[0])
     squares = np.nansum(distances**2) / max(count - loose.count, 1)
     covariance = _UNSEEN**2 * squares * np.linalg.inv(J.T @ J)
-    if DEBUG: print("patches",count,"error",np.sqrt(np.trace(covariance)))
     if not np.trace(covariance) < (MOST_ERROR * size) ** 2:
         return None
     twists = loose.twists(pose.uncertainty.centre)

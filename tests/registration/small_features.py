@@ -72,7 +72,10 @@ class Part:
             count = self.points // 5
             r, angle = 20.0 * np.sqrt(rng.uniform(0, 1, count)), rng.uniform(-np.pi, np.pi, count)
             lid = np.stack([r * np.cos(angle), r * np.sin(angle), np.full(count, 50.0)], 1)
-            points, out = np.vstack([points, lid]), np.vstack([out, np.tile([0, 0, 1.0], (count, 1))])
+            points, out = (
+                np.vstack([points, lid]),
+                np.vstack([out, np.tile([0, 0, 1.0], (count, 1))]),
+            )
             relief = np.append(relief, np.zeros(count))
         points = points + (relief + rng.normal(0, self.noise, len(points)))[:, None] * out
         return points * self.scale, out, relief * self.scale
