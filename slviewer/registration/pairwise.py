@@ -98,7 +98,8 @@ def register_prepared(
     share of the work done, 0 to 1, and may raise to cancel.
 
     Raises ``Refused`` where nothing aligns, where too little overlaps, where neither the shape nor
-    a small feature holds the pose, or where a second pose fits alike, between which a given start does not decide.
+    a small feature holds the pose, or where a second pose fits alike, between which a given start
+    does not decide.
     """
     if markers is not None:
         progress(0.4)

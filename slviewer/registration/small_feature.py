@@ -16,6 +16,7 @@ from slviewer.geometry.vectors import lengths, occupied_cubes, subsample, unit_v
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.refine import LooseMotions, RefinedPose, refine_pose
 from slviewer.registration.scan import PreparedScan
+from slviewer.registration.start import pose_distance
 
 MOST_ERROR = 1 / 100
 """Of the object's size: what a feature may leave open at the rim (1 sigma)."""
@@ -30,6 +31,8 @@ _EXPLAINED = 0.6
 """Least share of the feature's misfit that vanishes at the pose."""
 _ALIKE = 0.85
 """A rival's share of the best pose's gain."""
+_DISTINCT = 1 / 20
+"""Least distance of a rival from the pose, over the object's size."""
 _NEIGHBOURS, _OF_NORMALS = 6, 10
 _SURVEYED = (1 / 16, 1 / 8, 1 / 4, 1 / 2) * 3
 """Motions along which misfit is surveyed, over the object's size."""
@@ -176,9 +179,13 @@ def hold_by_feature(
     uncertainty = _estimate_uncertainty(feature, held, loose, width, size)
     if uncertainty is None:
         return []
-    return [
-        replace(each, uncertainty=uncertainty) for gain, each in solutions if gain >= _ALIKE * best
-    ]
+    # the edges of a step have several minima side by side
+    distinct = [held]
+    for gain, each in solutions:
+        gaps = [pose_distance(scan.fine_points, each.T, other.T) for other in distinct]
+        if gain >= _ALIKE * best and min(gaps) > _DISTINCT * size:
+            distinct.append(each)
+    return [replace(each, uncertainty=uncertainty) for each in distinct]
 
 
 def _detect_feature(
