@@ -1,8 +1,9 @@
 """Pairwise registration: point-to-plane ICP, coarse to fine, with checks of the result.
 
 A registration is refused, with the reason, unless the surfaces agree where they face each other,
-enough of the scan overlaps, the shape of the overlap determines all six degrees of freedom (a plane
-slides on a plane, a sphere turns in a sphere), and no other pose fits as well.
+enough of the scan overlaps, the shape of the overlap or a small feature on it determines all six
+degrees of freedom (a plane slides on a plane, a sphere turns in a sphere), and no other pose fits
+as well.
 """
 
 from collections.abc import Callable
@@ -17,12 +18,14 @@ from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.refine import (
     WORDS,
     Freedom,
+    LooseMotions,
     RefinedPose,
     estimate_freedom,
     refine_pose,
 )
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import PreparedScan, scale_of
+from slviewer.registration.small_feature import hold_by_feature
 from slviewer.registration.start import SEARCHED, Candidate, Start, pose_distance, search_starts
 
 Progress = Callable[[float], None]
@@ -35,6 +38,8 @@ LEAST_OVERLAP = 0.15
 LEAST_AGREEMENT = 0.8
 MOST_ATTEMPTS = 3
 MOST_SLACK = 1 / 30  # of the object's size
+_SLIGHT = 0.2
+"""Share of that slack from which a small feature holds the pose better than all points do."""
 LEAST_MARKERS = 2
 """In common, without overlap: of one alone nobody could tell that it was moved."""
 MOST_MARKER_ERROR = 1 / 300
@@ -92,31 +97,43 @@ def register_prepared(
     what the shape leaves open; alone, where the surfaces do not overlap. ``progress`` receives the
     share of the work done, 0 to 1, and may raise to cancel.
 
-    Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not
-    hold the pose, or where a second pose fits alike, between which a given start does not decide.
+    Raises ``Refused`` where nothing aligns, where too little overlaps, where neither the shape nor
+    a small feature holds the pose, or where a second pose fits alike, between which a given start
+    does not decide.
     """
     if markers is not None:
         progress(0.4)
         return _register_by_markers(scan, reference, markers, size)
     starts = start if isinstance(start, list) else search_starts(scan, reference, size, start)
     refusals: list[Refused] = []
+    given = start if isinstance(start, Candidate) else None
     for attempt, candidate in enumerate(starts[:MOST_ATTEMPTS]):
         progress(0.4 + 0.15 * attempt)
+        result, freedom = _align_start(scan, reference, candidate, size)
+        refusal = None
         try:
-            result = _refine_start(scan, reference, candidate, size)
+            _refuse_if_doubtful(result, freedom, size)
         except Refused as error:
             refusals.append(error)
-            # the surfaces agree, and every other start would slide or turn as well
-            if error.reason in WORDS:
-                break
-            continue
+            refusal = error
+            if error.reason not in WORDS:
+                continue
+        limit = MOST_SLACK * size
+        if freedom.loosest_mm > _SLIGHT * limit:
+            loose = freedom.loose_motions(min(limit, freedom.loosest_mm))
+            held = _hold_by_feature(scan, reference, result, loose, size, given)
+            if held is not None:
+                progress(1.0)
+                return held
+        # the surfaces agree, and every other start would slide or turn as well
+        if refusal is not None:
+            break
         if not candidate.is_decided:
             others = starts[attempt + 1 : MOST_ATTEMPTS + 1]
             if candidate.start not in SEARCHED:
                 others = search_starts(scan, reference, size)[: MOST_ATTEMPTS + 1]
             rival = _find_rival(scan, reference, result, candidate.score, others, size)
             if rival is not None:
-                given = start if isinstance(start, Candidate) else None
                 result = replace(result, rival_mm=_check_rival(scan, result, rival, given))
         progress(1.0)
         return result
@@ -160,6 +177,19 @@ def _refine_start(
 ) -> Registration:
     """Run ICP from an initial pose, and compute its figures; raises ``Refused`` where the result is
     not reliable."""
+    result, held = _align_start(scan, reference, start, size, markers)
+    _refuse_if_doubtful(result, None if markers is not None else held, size)
+    return result
+
+
+def _align_start(
+    scan: PreparedScan,
+    reference: PreparedScan,
+    start: Candidate,
+    size: float,
+    markers: MarkerPose | None = None,
+) -> tuple[Registration, Freedom]:
+    """Run ICP from an initial pose, and compute its figures and the freedom of the overlap."""
     scale = scale_of(size)
     T = start.T
     # of the distance of two corresponding points
@@ -173,9 +203,47 @@ def _refine_start(
             T = align_icp(*thinned, T, widest, loss, 1e-6, 40)
     narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * noise)
     pose = refine_pose(scan, reference, T, widest, narrowest, markers)
-    result, held = _compute_figures(scan, reference, pose, start.start)
-    _refuse_if_doubtful(result, None if markers is not None else held, size)
-    return result
+    return _compute_figures(scan, reference, pose, start.start)
+
+
+def _hold_by_feature(
+    scan: PreparedScan,
+    reference: PreparedScan,
+    result: Registration,
+    loose: LooseMotions,
+    size: float,
+    start: Candidate | None,
+) -> Registration | None:
+    """Return the registration of scans whose shape does not hold the pose, by a small feature; None
+    where there is none. A given ``start`` chooses between poses that fit alike; raises ``Refused``
+    where it does not."""
+    pose = RefinedPose(result.T_reference_scan, result.gate_mm, result.uncertainty)
+    held = []
+    for each in hold_by_feature(scan, reference, pose, loose, size):
+        figures, _ = _compute_figures(scan, reference, each, result.start)
+        if figures.overlap >= LEAST_OVERLAP and figures.agreement >= LEAST_AGREEMENT:
+            held.append(figures)
+    if not held:
+        return None
+    points = scan.fine_points
+    if start is not None:
+        held.sort(key=lambda each: pose_distance(points, start.T, each.T_reference_scan))
+    best = held[0]
+    for rival in held[1:]:
+        gap = pose_distance(points, best.T_reference_scan, rival.T_reference_scan)
+        if gap > RIVAL_GATES * best.gate_mm and _is_alike(rival, best):
+            if start is not None and start.is_decided:
+                break
+            return replace(best, rival_mm=_check_rival(scan, best, rival, start))
+    return best
+
+
+def _is_alike(rival: Registration, result: Registration) -> bool:
+    """Whether a rival overlaps and fits about as well as a result."""
+    return (
+        rival.overlap >= RIVAL_OVERLAP * result.overlap
+        and rival.rms_mm <= RIVAL_RMS * result.rms_mm
+    )
 
 
 def _compute_figures(
@@ -263,11 +331,7 @@ def _find_rival(
             continue
         gap = pose_distance(scan.fine_points, T, rival.T_reference_scan)
         distinct = gap > max(nearest, 10.0 * result.uncertainty.shift_mm)
-        alike = (
-            rival.overlap >= RIVAL_OVERLAP * result.overlap
-            and rival.rms_mm <= RIVAL_RMS * result.rms_mm
-        )
-        if distinct and alike:
+        if distinct and _is_alike(rival, result):
             return rival
     return None
 

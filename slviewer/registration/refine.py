@@ -13,7 +13,7 @@ normals would act like relief; so the matrix is the product of one scan's Jacobi
 whose noise is independent and cancels.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -65,9 +65,10 @@ def refine_pose(
     widest: float,
     narrowest: float,
     markers: MarkerPose | None = None,
+    loose: "LooseMotions | None" = None,
 ) -> RefinedPose:
     """Refine a pose ``T`` (4, 4) by symmetric point-to-plane ICP on the thinned clouds, and by the
-    corners of markers.
+    corners of markers; ``loose`` motions do not change it.
 
     The gate decreases from ``widest`` mm to three times the residuals' noise, not below
     ``narrowest`` mm. With too few pairs the current pose is returned with infinite uncertainty.
@@ -81,7 +82,7 @@ def refine_pose(
         pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
         if pairs is None:
             return RefinedPose(T, gate, _UNKNOWN)
-        e = _linearise(*pairs, T, markers)
+        e = _linearise(*pairs, T, markers, loose)
         if not steps_left:
             return RefinedPose(T, gate, _estimate_uncertainty(pairs[0], e))
         steps_left -= 1
@@ -155,12 +156,17 @@ def _linearise(
     residual: Floats,
     T: Floats,
     markers: MarkerPose | None,
+    loose: "LooseMotions | None",
 ) -> _Equations:
     """Return the normal equations of pairs, as of ``_match_pairs``, and of markers at a pose ``T``
-    (4, 4)."""
+    (4, 4), without ``loose`` motions."""
     centre = points.mean(axis=0)
     sigma = max(robust_sigma(residual, about=0.0), 1e-6)
     J, weight = distance_jacobian(points - centre, normal), tukey_weights(residual, sigma)
+    if loose is not None:
+        # the noise of normals would act like relief
+        twists = loose.twists(centre)
+        J = J - J @ np.linalg.pinv(twists) @ twists
     gradients = J * (weight * residual)[:, None]
     H, gradient = (J * weight[:, None]).T @ J, gradients.sum(axis=0)
     scatter = np.zeros((6, 6))
@@ -197,12 +203,14 @@ class Freedom:
     """Principal motions of a scan on its reference, and how well the shape determines each.
 
     ``slack_mm`` (6,), ascending: the motion at the overlap's rim that separates the surfaces by the
-    noise (RMS). ``motions`` (6, 6): a rotation and a translation per row, with lengths in units of
-    the overlap's radius.
+    noise (RMS). ``motions`` (6, 6): a rotation about the ``centre`` (3,) mm and a translation per
+    row, with lengths in units of the overlap's ``radius``, mm.
     """
 
     slack_mm: Floats
     motions: Floats
+    centre: Floats = field(default_factory=lambda: np.zeros(3))
+    radius: float = 1.0
 
     @property
     def loosest_mm(self) -> float:
@@ -221,6 +229,52 @@ class Freedom:
         if len(loose) == 2:
             return "cylinder" if turns else "plane"
         return "turns" if turns else "slides"
+
+    def loose_motions(self, limit_mm: float) -> "LooseMotions":
+        """Return the motions by which ``shape`` classifies."""
+        loose = self.motions[self.slack_mm > 0.5 * limit_mm]
+        U, length, directions = np.linalg.svd(loose[:, :3])
+        count = int(np.count_nonzero(length > 0.3))
+        turns, combined = directions[:count], U.T @ loose[:, 3:]
+        # a turn about a point c moves the centre by -turn x c
+        crossed = np.cross(turns[:, None], np.eye(3)).swapaxes(1, 2).reshape(-1, 3)
+        moved = (combined[:count] / length[:count, None]).ravel()
+        point = np.linalg.lstsq(crossed, -moved, rcond=0.1)[0] if count else np.zeros(3)
+        shifts = np.linalg.svd(combined[count:], full_matrices=False)[2]
+        return LooseMotions(
+            turns / self.radius, shifts, self.centre + self.radius * point, self.radius
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LooseMotions:
+    """The motions that leave a shape on itself: ``turns`` (r, 3) about a ``centre`` (3,) mm, in rad
+    per mm at the overlap's ``radius`` mm, and ``shifts`` (s, 3), unit vectors."""
+
+    turns: Floats
+    shifts: Floats
+    centre: Floats
+    radius: float
+
+    @property
+    def count(self) -> int:
+        """Number of independent motions."""
+        return len(self.turns) + len(self.shifts)
+
+    @property
+    def spins(self) -> bool:
+        """Whether a point may stay where it is: on planes and spheres."""
+        return self.count > 2
+
+    def move(self, amounts: Floats) -> Floats:
+        """Return the motion (4, 4) by amounts (r + s,) mm."""
+        count = len(self.turns)
+        return turn_about(amounts[:count] @ self.turns, self.centre, amounts[count:] @ self.shifts)
+
+    def twists(self, centre: Floats) -> Floats:
+        """Return (r + s, 6): rotations about ``centre`` (3,) mm, rad, and translations, mm."""
+        turns = np.hstack([self.turns, np.cross(self.turns, centre - self.centre)])
+        return np.vstack([turns, np.hstack([np.zeros_like(self.shifts), self.shifts])])
 
 
 WORDS: dict[Shape, str] = {
@@ -249,10 +303,12 @@ def estimate_freedom(
     scan_normals = normals[cKDTree(move_points(T, smooth_points)).query(points)[1]] @ T[:3, :3].T
     is_opposite = np.sum(scan_normals * reference_normals, axis=1, keepdims=True) < 0
     scan_normals = np.where(is_opposite, -scan_normals, scan_normals)
-    arm = points - points.mean(axis=0)
-    arm /= rms_length(arm)
+    centre = points.mean(axis=0)
+    arm = points - centre
+    radius = rms_length(arm)
+    arm /= radius
     A, B = distance_jacobian(arm, reference_normals), distance_jacobian(arm, scan_normals)
-    return freedom_of(A.T @ B / len(points), rms)
+    return replace(freedom_of(A.T @ B / len(points), rms), centre=centre, radius=radius)
 
 
 def freedom_of(information: Floats, rms: float) -> Freedom:
