@@ -22,6 +22,8 @@ from slviewer.surface.shapes import extent_across, label_connected
 
 NOISE = 4.0
 """Standard deviations: what is nearer to the nominal than that lies on it."""
+LINK = 2.0
+"""Of the spacing that most neighbours of a scan keep threefold: within a cluster."""
 MIN_CLUSTER = 5
 """Points of a cluster; fewer are spikes."""
 MIN_TABLE = 50
@@ -32,8 +34,10 @@ FOOTPRINT_SHARE = 0.5
 """Share of a cluster's points over the footprint, or inside the nominal, that makes it a deviation
 of the part."""
 BURR = 0.1
-"""Of the nominal's diagonal: something smaller that touches the part beside its footprint is the
-part's own, a burr or dirt; something larger may be a clamp."""
+"""Of the nominal's diagonal: what touches the part beside its footprint and reaches less far from
+it is the part's own, a burr or dirt; what reaches farther may be a clamp."""
+STANDING = 0.9
+"""Share of what touches the part that lies over the touched face, if it is a feature of the part."""
 CONTACT = 0.5
 """Of the spacing that most neighbours of a scan keep threefold: what is nearer touches."""
 MAX_CONTACT_POINTS = 200_000
@@ -115,7 +119,7 @@ def classify_points(
     is_over = np.arange(len(rest)) < inside_count
     is_over[inside_count:] = _is_over(scan, outside, surface, views)
     alone = list[np.ndarray]()
-    for members in label_clusters(scan.points[rest], scan.spacing_mm):
+    for members in label_clusters(scan.points[rest], LINK * scan.spacing_mm):
         cluster = rest[members]
         if len(cluster) < MIN_CLUSTER:
             alone.append(cluster)
@@ -126,7 +130,10 @@ def classify_points(
         is_attached = part is not None and bool(
             (part.query(subsample(places, 20_000))[0] <= CONTACT * scan.spacing_mm).any()
         )
-        if is_attached and extent_across(places) < BURR * surface.diagonal:
+        if is_attached and (
+            np.abs(signed[cluster]).max() < BURR * surface.diagonal
+            or _stands_on(scan, cluster, signed, surface)
+        ):
             continue
         foreign.append(cluster)
         excluded.append(_describe("touching" if is_attached else "beside", places))
@@ -183,6 +190,16 @@ def _is_over(
     is_over = ~known
     is_over[known] = surface.is_hit(points[known], (1.0 if outwards else -1.0) * normals[known])
     return is_over
+
+
+def _stands_on(
+    scan: LocatedPoints, cluster: np.ndarray, signed: Floats, surface: NominalSurface
+) -> bool:
+    """Return whether all of a cluster (k,) lies over the face of the nominal that it touches."""
+    nearest = np.argsort(np.abs(signed[cluster]))[: max(3, len(cluster) // 20)]
+    facing = unit_vectors(np.nan_to_num(scan.towards[cluster[nearest]]).mean(axis=0))
+    points = scan.points[subsample(cluster, 2000)]
+    return bool(surface.is_hit(points, np.broadcast_to(-facing, points.shape)).mean() >= STANDING)
 
 
 def _plane_tolerance(scan: LocatedPoints) -> float:

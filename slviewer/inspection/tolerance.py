@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, distance_jacobian
-from slviewer.geometry.vectors import occupied_cubes
+from slviewer.geometry.vectors import occupied_cubes, rms
 from slviewer.inspection.deviation import Deviation
 from slviewer.inspection.exclusion import label_clusters
 from slviewer.records.acceptance import COVERAGE, Decision, worst_decision
@@ -27,10 +27,11 @@ MEAN_SHARE = 0.19
 larger. Larger means hide small errors, smaller ones exceed the tolerance by noise."""
 LEAST_POINTS, MOST_POINTS = 6, 64
 """Averaged in a local mean."""
-WIDER = 4
-"""Times as many points are averaged where that shows an error more clearly."""
-FAIL_SIGMAS = 3.0
-"""Standard deviations by which a local mean fails: there are hundreds of them."""
+FAIL_SIGMAS = {1: 3.0, 2: 2.5, 4: 2.0, 8: 2.0}
+"""Standard deviations by which a mean fails, by how many times as many points it averages: there
+are hundreds of the smallest."""
+SUSPECT = 0.8
+"""Of the tolerance: of means beyond it wider ones are made."""
 MOST_MEANS = 60_000
 """Points of larger scans are combined first."""
 FACE = 3.0
@@ -76,9 +77,10 @@ class _Means:
         """Return some of the means."""
         return _Means(**{name: values[chosen] for name, values in vars(self).items()})
 
-    def beyond(self, tolerance: float, sigmas: float = FAIL_SIGMAS) -> Floats:
-        """By how much (n,) mm a mean exceeds the tolerance in spite of its uncertainty."""
-        return np.abs(self.value) - sigmas * self.sigma - tolerance
+    def bound(self, times: int = 1) -> Floats:
+        """Return what a mean of so many ``times`` the least number of points exceeds in spite of
+        its uncertainty, (n,) mm."""
+        return np.abs(self.value) - FAIL_SIGMAS[times] * self.sigma
 
 
 def judge_deviation(
@@ -155,7 +157,7 @@ def _ends(values: Floats) -> tuple[np.intp, np.intp]:
 def _judge_end(means: _Means, end: int, tolerance: float) -> tuple[float, Decision]:
     """Return a local mean and its decision."""
     value, sigma = float(means.value[end]), float(means.sigma[end])
-    if abs(value) - FAIL_SIGMAS * sigma > tolerance:
+    if abs(value) - FAIL_SIGMAS[1] * sigma > tolerance:
         return value, "fail"
     is_inside = abs(value) + COVERAGE * sigma <= tolerance
     return value, "pass" if is_inside else "undecided"
@@ -172,7 +174,10 @@ def _list_points(deviation: Deviation, sigma_mm: Floats, common_mm: Floats | Non
     common = np.zeros(len(value)) if common_mm is None else np.nan_to_num(common_mm[counted])
     spread = deviation.alignment_spread
     J = distance_jacobian(places - spread.centre, normals.astype(np.float64))
-    aligned = np.einsum("ni,ij,nj->n", J, spread.covariance, J)
+    # the part's form is no uncertainty of a best fit to it
+    matched = value[~deviation.is_unmatched[counted]]
+    share = min(1.0, float(np.median(noise)) / max(rms(matched), 1e-12))
+    aligned = share**2 * np.einsum("ni,ij,nj->n", J, spread.covariance, J)
     common = np.sqrt(common.astype(np.float64) ** 2 + aligned)
     unmatched = deviation.is_unmatched[counted]
     points = _Points(places, facing, value, noise, common, unmatched)
@@ -218,9 +223,8 @@ def _average(points: _Points, count: int, chosen: np.ndarray | None = None) -> _
     value = points.value[trimmed].mean(axis=1)
     noise = np.sqrt(np.mean(points.noise[near] ** 2, axis=1) / count)
     # what the deviation changes by within the mean, beyond noise
-    varies = np.maximum(
-        points.value[near].var(axis=1) - np.mean(points.noise[near] ** 2, axis=1), 0.0
-    )
+    most = (1 + 2 * np.sqrt(2 / count)) * np.mean(points.noise[near] ** 2, axis=1)
+    varies = np.maximum(points.value[trimmed].var(axis=1) - most, 0.0)
     sigma = np.sqrt(noise**2 + points.common[near].mean(axis=1) ** 2 + varies / count)
     return _Means(value, sigma, distance.max(axis=1), np.sqrt(varies))
 
@@ -235,15 +239,19 @@ def _list_places(
     deviation: Deviation, points: _Points, means: _Means, count: int, tolerance: float
 ) -> tuple[DeviatingPlace, ...]:
     """Return the connected areas out of tolerance, the worst first."""
-    suspect = np.flatnonzero(np.abs(means.value) > 0.8 * tolerance)
-    if len(suspect) and WIDER * count < len(points):
-        wide = _average(points, WIDER * count, suspect)
-        is_better = wide.beyond(0.0) > means.take(suspect).beyond(0.0)
-        means = _replace(means, suspect[is_better], wide.take(is_better))
+    bound = means.bound()
+    for times in list(FAIL_SIGMAS)[1:]:
+        suspect = np.flatnonzero(np.abs(means.value) > SUSPECT * tolerance)
+        if not len(suspect) or times * count > len(points):
+            break
+        wider = _average(points, times * count, suspect)
+        is_better = wider.bound(times) > bound[suspect]
+        bound[suspect[is_better]] = wider.bound(times)[is_better]
+        means = _replace(means, suspect[is_better], wider.take(is_better))
     area, link = deviation.area, max(deviation.area.spacing_mm, float(np.median(means.radius)))
     found = list[DeviatingPlace]()
     missing = np.flatnonzero(np.abs(np.nan_to_num(area.deviation)) > tolerance + area.spacing_mm)
-    out = means.beyond(tolerance) > 0
+    out = bound > tolerance
     for sign in (-1, 1):
         own = np.flatnonzero(out & (np.sign(means.value) == sign))
         samples = missing[np.sign(area.deviation[missing]) == sign]
@@ -252,7 +260,11 @@ def _list_places(
             if len(members) < MIN_PLACE:
                 continue
             measured, places = own[members[members < len(own)]], members[members >= len(own)]
-            found.append(_describe(points, means, measured, deviation, samples[places - len(own)]))
+            found.append(
+                _describe(
+                    points, means, bound, measured, count, deviation, samples[places - len(own)]
+                )
+            )
     found.sort(key=lambda each: -abs(each.value_mm))
     return tuple(found[:MOST_PLACES])
 
@@ -268,18 +280,18 @@ def _replace(means: _Means, which: np.ndarray, others: _Means) -> _Means:
 def _describe(
     points: _Points,
     means: _Means,
+    bound: Floats,
     measured: np.ndarray,
     count: int,
     deviation: Deviation,
     samples: np.ndarray,
 ) -> DeviatingPlace:
-    """Return an area out of tolerance from the ``measured`` means, of ``count`` points each, and
-    the ``samples`` of the nominal in it."""
+    """Return an area out of tolerance from the ``measured`` means, of ``count`` points and more,
+    what they exceed for certain (``bound``), and the ``samples`` of the nominal in it."""
     area = deviation.area
     worst, sigma, place = 0.0, 0.0, np.zeros(3)
     if len(measured):
-        bounds = means.beyond(0.0)[measured]
-        first = measured[int(np.argmax(bounds))]
+        first = measured[int(np.argmax(bound[measured]))]
         worst, place = means.value[first], points.place[first]
         # the largest of several means is too large by noise; what one averages has a larger peak
         chosen = np.sqrt(1 + 2 * np.log(max(1.0, len(measured) / count)))
