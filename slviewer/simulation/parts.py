@@ -28,6 +28,8 @@ COVER = 12_000
 MAX_SIZE_ERROR = 0.02
 GAP = 0.03
 """Between features, and to the part's edge, over the part's size: more than any fault moves one."""
+SHRINK = 0.96
+"""Of a feature without room, before the next try."""
 CORNERS = 40
 """Of a round outline."""
 
@@ -239,19 +241,21 @@ def draw_feature(rng: np.random.Generator, part: Part, kind: PartKind) -> Featur
 
 
 def place_feature(rng: np.random.Generator, part: Part, feature: Feature) -> Feature:
-    """The feature at a place that has room for it. Raises UnsuitedPartError where none has."""
+    """The feature at a place that has room for it, shortened if need be. Raises UnsuitedPartError
+    where none has."""
     gap = GAP * part.size
-    margin = gap if part.is_free_form else feature.radius + gap
-    for _ in range(30):
+    for _ in range(40):
+        a, b = feature.half
+        margin = gap if part.is_free_form else feature.radius + gap
         i = rng.integers(len(part.levels))
         low = np.array([part.edges[i], -part.half_width]) + margin
         high = np.array([part.edges[i + 1], part.half_width]) - margin
-        if (low > high).any():
-            continue
-        x, y = rng.uniform(low, high)
-        room = [np.hypot(x - f.centre[0], y - f.centre[1]) - f.radius for f in part.features]
-        if part.is_free_form or min(room, default=np.inf) > feature.radius + 2 * gap:
-            return replace(feature, centre=(x, y))
+        if (low <= high).all():
+            x, y = rng.uniform(low, high)
+            room = [np.hypot(x - f.centre[0], y - f.centre[1]) - f.radius for f in part.features]
+            if part.is_free_form or min(room, default=np.inf) > feature.radius + 2 * gap:
+                return replace(feature, centre=(x, y))
+        feature = replace(feature, half=(a * SHRINK if a >= b else a, b * SHRINK if b >= a else b))
     raise UnsuitedPartError("no room")
 
 
@@ -270,8 +274,13 @@ def draw_change(rng: np.random.Generator, part: Part, kind: PartKind, fault: Loc
 
         return add
     count = int(rng.integers(2, 4)) if fault == "revision" else 1
+    chosen = rng.permutation(len(part.features))[:count]
+    if fault == "turned" and not part.is_free_form:
+        # few parts have a slim feature of their own
+        slim = draw_feature(rng, part, "ribs" if kind == "ribs" else "slots")
+        part, chosen = part.add(place_feature(rng, part, slim)), np.array([len(part.features)])
     weights, steps = (1.0, *rng.uniform(0.3, 0.9, count - 1)), []
-    for weight, i in zip(weights, rng.permutation(len(part.features)), strict=False):
+    for weight, i in zip(weights, chosen, strict=True):
         own = str(rng.choice(["length", "moved", "width"])) if fault == "revision" else fault
         steps.append((i, own, weight * rng.choice([-1, 1]), rng.uniform(0, 2 * np.pi)))
 

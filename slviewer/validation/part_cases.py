@@ -46,6 +46,8 @@ MIN_COSINE = 0.2
 """Of the angle of incidence at which a camera measures."""
 MIN_SEEN, MIN_EVIDENCE = 0.2, 6
 """Share of the faulty region, and points that deviate, without which a fault is not in view."""
+MIN_SHOWN = 0.2
+"""Of a deformation, over its largest displacement, what the measured points have to deviate by."""
 SPACINGS = 3.0
 """From a place to the nearest one that was measured, or that changed."""
 TOUCHING = 1e-4
@@ -260,9 +262,8 @@ def _solve_deformation(
     J = distance_jacobian(points, normals)
     off = (_list_monomials(points) @ field.T * normals).sum(axis=1)
     motion = np.linalg.lstsq(J, off, rcond=None)[0]
-    largest = float(np.abs(off - J @ motion).max())
-    if not largest > 1e-9 * float(np.abs(off).max()):
-        raise UnsuitedPartError("the deformation moves its surfaces along themselves")
+    if not (largest := float(np.abs(off - J @ motion).max())) > MIN_SHOWN:
+        raise UnsuitedPartError("what was measured hardly shows the deformation")
     amount = size_mm / largest
 
     def deform(places: Floats) -> Floats:
@@ -271,8 +272,6 @@ def _solve_deformation(
 
     for _ in range(4):
         amount *= size_mm / np.partition(nominal.closest(deform(points))[1], -rank)[-rank]
-    if amount > 5 * size_mm:
-        raise UnsuitedPartError("what was measured hardly shows the deformation")
     return deform
 
 
