@@ -30,6 +30,8 @@ LEAST_POINTS, MOST_POINTS = 6, 64
 FAIL_SIGMAS = {1: 3.0, 2: 2.5, 4: 2.0, 8: 2.0}
 """Standard deviations by which a mean fails, by how many times as many points it averages: there
 are hundreds of the smallest."""
+SINGLE_SIGMAS = 4.0
+"""Standard deviations by which single points fail, three or more beside each other."""
 SUSPECT = 0.8
 """Of the tolerance: of means beyond it wider ones are made."""
 MOST_MEANS = 60_000
@@ -239,7 +241,13 @@ def _list_places(
     deviation: Deviation, points: _Points, means: _Means, count: int, tolerance: float
 ) -> tuple[DeviatingPlace, ...]:
     """Return the connected areas out of tolerance, the worst first."""
-    bound = means.bound()
+    single = _Means(
+        points.value, np.hypot(points.noise, points.common), means.radius, 0 * means.radius
+    )
+    bound, certain = means.bound(), np.abs(single.value) - SINGLE_SIGMAS * single.sigma
+    is_better = (certain > bound) & (certain > tolerance)
+    bound[is_better] = certain[is_better]
+    means = _replace(means, np.flatnonzero(is_better), single.take(is_better))
     for times in list(FAIL_SIGMAS)[1:]:
         suspect = np.flatnonzero(np.abs(means.value) > SUSPECT * tolerance)
         if not len(suspect) or times * count > len(points):

@@ -44,8 +44,9 @@ SIZES = (0.5, LEAST_WRONG, 2.0, 5.0, 20.0)
 MAX_ATTEMPTS = 100
 MIN_COSINE = 0.2
 """Of the angle of incidence at which a camera measures."""
-MIN_SEEN, MIN_EVIDENCE = 0.2, 6
-"""Share of the faulty region, and points that deviate, without which a fault is not in view."""
+MIN_SEEN, MIN_EVIDENCE, MIN_SIGMAS = 0.2, 6, 3.0
+"""Share of the faulty region, points that deviate by more than the tolerance, and standard
+deviations of their mean by which they exceed it, without which a fault is not in view."""
 MIN_SHOWN = 0.2
 """Of a deformation, over its largest displacement, what the measured points have to deviate by."""
 SPACINGS = 3.0
@@ -101,8 +102,10 @@ class PartCase:
 
     @property
     def in_view(self) -> bool:
-        """Whether the scan shows the fault."""
-        return self.seen >= MIN_SEEN and self.evidence >= MIN_EVIDENCE
+        """Whether the scan shows the fault, and noise does not hide it."""
+        share = float(np.median(self.sigma_mm)) / self.tolerance_mm
+        needed = (MIN_SIGMAS * share / max(self.setup.size - 1, 1e-3)) ** 2
+        return self.seen >= MIN_SEEN and self.evidence >= max(MIN_EVIDENCE, needed)
 
     def changed_near(self, place: Floats) -> Floats:
         """The deviations (m,) mm of the changed places within a few spacings of one (3,)."""
