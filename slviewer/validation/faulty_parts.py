@@ -1,6 +1,6 @@
-"""Parts of planes, cylinders and a sphere with one fault each, clouds of their points, and what each
-characteristic of their inspection plan truly is: by least squares and zones of dense points without
-noise, by code of its own."""
+"""Parts of planes, cylinders and a sphere with one fault each, and what each characteristic of their
+inspection plan truly is: by least squares and zones of dense points without noise, by code of its
+own."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -35,7 +35,7 @@ class Patch:
 
     A plane spans ``size`` (half sides) along the first ``axes`` (3, 3); a cylinder has ``size``
     (radius, half length) about the third; a sphere is the half of radius ``size[0]`` above. A ring
-        lies between a square of half side ``-size[0]`` and one of ``size[1]``, which are circles where
+    lies between a square of half side ``-size[0]`` and one of ``size[1]``, which are circles where
     ``size`` has the other sign. ``side``: -1 where material is outside, as around a hole.
     """
 
@@ -76,7 +76,10 @@ class Patch:
             local = np.stack([a * u, b * v, zero], 1)
             if self.kind == "ring":
                 square = 1 / np.maximum(np.abs(c), np.abs(s))
-                inner, outer = abs(a) * np.where(a < 0, square, 1), abs(b) * np.where(b > 0, square, 1)
+                inner, outer = (
+                    abs(a) * np.where(a < 0, square, 1),
+                    abs(b) * np.where(b > 0, square, 1),
+                )
                 r = (1 - v) / 2 * inner + (1 + v) / 2 * outer
                 local = np.stack([r * c, r * s, zero], 1)
         return local @ self.axes + self.origin, normals @ self.axes
@@ -86,9 +89,9 @@ class Patch:
         uv = rng.uniform(-1, 1, (count, 2))
         if self.kind == "ring":
             a, b = np.abs(self.size)
-            uv[:, 1] = 2 * (np.sqrt(a * a + (b * b - a * a) * rng.uniform(size=count)) - a) / (
-                b - a
-            ) - 1
+            uv[:, 1] = (
+                2 * (np.sqrt(a * a + (b * b - a * a) * rng.uniform(size=count)) - a) / (b - a) - 1
+            )
         return uv
 
     def mesh(self) -> tuple[Array, Array]:
@@ -98,9 +101,7 @@ class Patch:
         u, v = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
         vertices, normals = self.points(np.stack([u, v], -1).reshape(-1, 2))
         at = np.arange(rows * columns).reshape(rows, columns)
-        a, b, c, d = (
-            each.ravel() for each in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1])
-        )
+        a, b, c, d = (each.ravel() for each in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
         faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
         corners = vertices[faces]
         facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -190,8 +191,9 @@ def draw_part(rng: Rng, points: int) -> FaultyPart:
     t, T, H = float(S * np.exp(rng.uniform(np.log(1e-3), np.log(3e-3)))), S / 6, S / 6
     r, h, R = (float(x) * T for x in rng.uniform([0.5, 0.5, 0.5], [0.62, 0.7, 0.62]))
     tiles = [np.array([x, y, 0.0]) for x in (-2 * T, 0.0, 2 * T) for y in (-T, T)]
-    at = dict(zip(("base", "plain", "block", "pin", "hole", "dome"), rng.permutation(6)))
-    where = {name: tiles[k] for name, k in at.items()}
+    order = rng.permutation(6)
+    shown = ("base", "plain", "block", "pin", "hole", "dome")
+    where = {name: tiles[k] for name, k in zip(shown, order, strict=True)}
     z, x, y = np.eye(3)[[2, 0, 1]]
     up, towards_x, towards_y = np.eye(3), np.array([y, z, x]), np.array([z, x, y])
     made = [
@@ -253,7 +255,8 @@ def weigh(patch: Patch) -> float:
 
 
 def _distance(kind: ShapeKind, p: Array, axis: Array, points: Array) -> Array:
-    """Distances (n,) of points from a shape of parameters (6,): place, tilts of ``axis``, radius."""
+    """Distances (n,) of points from a shape of parameters (6,): place, tilts of ``axis``,
+    radius."""
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
     n = axis + p[3] * first + p[4] * np.cross(axis, first)
@@ -315,9 +318,9 @@ def datum_frame(features: Mapping[str, TrueFeature]) -> Array:
     z = features["base"].axis
     x = features["left"].axis - (features["left"].axis @ z) * z
     x = x / np.linalg.norm(x)
-    rows = np.array([features[n].axis for n in ("base", "left", "front")])
+    datums = [features[name] for name in ("base", "left", "front")]
     origin = np.linalg.solve(
-        rows, [row @ features[n].place for row, n in zip(rows, ("base", "left", "front"))]
+        np.array([each.axis for each in datums]), [each.axis @ each.place for each in datums]
     )
     T = np.eye(4)
     T[:3, :3] = [x, np.cross(z, x), z]
@@ -360,7 +363,9 @@ def nominal_distance(patch: Patch, points: Array) -> tuple[Array, Array]:
     return size - patch.size[0], offsets / size[:, None]
 
 
-def true_value(kind: str, names: tuple[str, ...], part: FaultyPart, found: Mapping[str, Any]) -> float:
+def true_value(
+    kind: str, names: tuple[str, ...], part: FaultyPart, found: Mapping[str, Any]
+) -> float:
     """The true value of a characteristic of features ``found``, in part coordinates."""
     f: TrueFeature = found[names[0]]
     d: TrueFeature = found[names[-1]]
@@ -386,9 +391,7 @@ def true_value(kind: str, names: tuple[str, ...], part: FaultyPart, found: Mappi
         n = d.axis if kind == "parallelism" else f.axis - (f.axis @ d.axis) * d.axis
         return float(np.ptp(f.points @ (n / np.linalg.norm(n))))
     if kind == "distance":
-        return 0.5 * float(
-            abs((f.place - d.place) @ d.axis) + abs((d.place - f.place) @ f.axis)
-        )
+        return 0.5 * float(abs((f.place - d.place) @ d.axis) + abs((d.place - f.place) @ f.axis))
     if kind == "angle":
         return float(np.degrees(np.arccos(min(abs(f.axis @ d.axis), 1.0))))
     if kind == "height of the centre":

@@ -22,7 +22,6 @@ from slviewer.session.inspection_plan import Alignment, Plan, PlanFeature
 from slviewer.validation.faulty_parts import (
     Array,
     FaultyPart,
-    Patch,
     Rng,
     best_fit,
     datum_frame,
@@ -128,7 +127,7 @@ def measure_part(part: FaultyPart, rng: Rng, points: int, noise: float, is_full:
     total = sum(weigh(each) * each.area for each in part.patches.values())
     names, places, normals = [], [], []
     for name, patch in part.patches.items():
-        n = int(round(points * weigh(patch) * patch.area / total))
+        n = round(points * weigh(patch) * patch.area / total)
         source = part.replaced.get(name, patch) if part.fault.kind == "missing" else patch
         where, facing = part.true_points(
             name, (source if name == part.fault.feature else patch).draw(n, rng)
@@ -181,8 +180,7 @@ def _draw_clamp(part: FaultyPart, rng: Rng, points: int) -> tuple[Array, Array]:
 
 def make_plan(part: FaultyPart, scene: Scene, rng: Rng, kind: str, nominal: Path) -> Plan:
     """The plan of a part, in its own frame, or in the camera's where nothing aligns it."""
-    S, t = part.size_mm, part.tolerance_mm
-    T = np.eye(4)
+    S, T = part.size_mm, np.eye(4)
     if kind == "none":
         T = scene.T_camera_part
     elif kind == "3-2-1":
@@ -226,10 +224,7 @@ def _list_characteristics(part: FaultyPart, alignment: str) -> Iterator[Characte
     def about(kind: str, names: tuple[str, ...], value: float, unit: str = "mm") -> Characteristic:
         off = t if unit == "mm" else float(np.degrees(t / at["left"].size[0]))
         name = f"{' '.join(names)} {kind}"
-        low = None if unit == "deg" else value - off
-        if unit == "deg":
-            low = value - off
-        return Characteristic(name, kind, names, value, low, value + off, unit)
+        return Characteristic(name, kind, names, value, value - off, value + off, unit)
 
     for name in FITTED:
         form = KINDS[at[name].kind]
@@ -261,7 +256,7 @@ def run_case(seed: int) -> list[PlanCase]:
     t = part.tolerance_mm
     share = float(rng.choice([0.1, 1 / 3]))
     is_full = bool(rng.uniform() < 0.6)
-    kind = str(rng.choice(["none", "3-2-1", "best fit"], p=[0.4, 0.4, 0.2]))
+    kind = str(rng.choice(["none", "3-2-1", "best fit"], p=[0.45, 0.45, 0.1]))
     scene = measure_part(part, rng, points, share * t, is_full)
     with tempfile.TemporaryDirectory() as folder:
         nominal = Path(folder, "part.ply")
@@ -380,7 +375,9 @@ def summarize_cases(cases: Sequence[PlanCase], scale: float) -> Proof:
     passes = [c for c in wrong if c.result.decision == "pass"]
     fails = [c for c in right if c.result.decision == "fail"]
     undecided = [c for c in clear if c.result.decision == "undecided"]
-    rows = [_list_row(kind, [c for c in cases if c.kind == kind]) for kind in _unique(cases, "kind")]
+    rows = [
+        _list_row(kind, [c for c in cases if c.kind == kind]) for kind in _unique(cases, "kind")
+    ]
     rows += [
         _list_row(f"fault: {fault}", [c for c in cases if c.fault == fault])
         for fault in _unique(cases, "fault")
@@ -389,17 +386,16 @@ def summarize_cases(cases: Sequence[PlanCase], scale: float) -> Proof:
         BandCheck("wrong", "number that pass", len(passes), 0, 0),
         BandCheck("right", "share that fails", len(fails) / len(right), 0, MOST_FALSE_FAILS),
         BandCheck(
-            "clearly right", "share undecided", len(undecided) / max(len(clear), 1), 0, MOST_UNDECIDED
+            "clearly right",
+            "share undecided",
+            len(undecided) / max(len(clear), 1),
+            0,
+            MOST_UNDECIDED,
         ),
     ]
     lines = [f"FALSE PASS {c.text()}" for c in passes] + [f"FALSE FAIL {c.text()}" for c in fails]
     lines += [f"UNDECIDED {c.text()}" for c in undecided[:60]]
     return prove_checks(checks, scale, rows, {"cases": cases}, below=lines)
-
-
-def _unique(cases: Sequence[PlanCase], name: str) -> list[str]:
-    """The values of a field, in order."""
-    return list(dict.fromkeys(getattr(case, name) for case in cases))
 
 
 def _list_row(title: str, cases: Sequence[PlanCase]) -> dict[str, Any]:
