@@ -1,6 +1,6 @@
-"""Parts of planes, cylinders and a sphere with one fault each, and what each characteristic of their
-inspection plan truly is: by least squares and zones of dense points without noise, by code of its
-own."""
+"""Parts of planes, cylinders and a sphere with one fault each, and what each characteristic of
+their inspection plan truly is: by least squares and zones of dense points without noise, by code of
+its own."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

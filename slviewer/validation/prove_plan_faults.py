@@ -376,11 +376,9 @@ def summarize_cases(cases: Sequence[PlanCase], scale: float) -> Proof:
     fails = [c for c in right if c.result.decision == "fail"]
     undecided = [c for c in clear if c.result.decision == "undecided"]
     rows = [
-        _list_row(kind, [c for c in cases if c.kind == kind]) for kind in _unique(cases, "kind")
-    ]
-    rows += [
-        _list_row(f"fault: {fault}", [c for c in cases if c.fault == fault])
-        for fault in _unique(cases, "fault")
+        _list_row(f"{field}: {value}", [c for c in cases if getattr(c, field) == value])
+        for field in ("kind", "fault")
+        for value in dict.fromkeys(getattr(c, field) for c in cases)
     ]
     checks = [
         BandCheck("wrong", "number that pass", len(passes), 0, 0),
