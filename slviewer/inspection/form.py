@@ -26,7 +26,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, Uncertainty
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import PATCHES, finite_rows, subsample, sum_by_cube, unit_vectors
-from slviewer.inspection.features import Feature, perpendicular_axes
+from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
 from slviewer.inspection.membership import find_isolated
 from slviewer.inspection.uncertainty import (
@@ -62,9 +62,6 @@ BURN_IN, THINNING = 50, 3
 kept."""
 THIN = 0.01
 POINTS_PER_TERM = 10
-SECTION_SHARE = 0.1
-"""Thickness of the section whose roundness is measured, as a share of the region's length along the
-axis, or of a sphere's diameter."""
 MAX_TILT_DEG = 10.0
 """Features farther from parallel or perpendicular than this are not meant to be so."""
 
@@ -206,38 +203,29 @@ def zone_width(
 def form_error(
     kind: FormKind, fit: FeatureFit, points: Floats, shared: Shared | None = None
 ) -> Quantity:
-    """Flatness of a plane, cylindricity of a cylinder, roundness of a section of a cylinder or a
-    sphere, mm.
+    """Flatness of a plane, cylindricity of a cylinder, roundness of a cylinder or a sphere, mm.
 
-    ``points`` (n, 3) mm: of the region. A cylinder's section is perpendicular to its axis, in the
-    middle; a sphere's goes through its centre and the middle of what was measured. Raises
-    InputError for another feature or for too few points.
+    ``points`` (n, 3) mm: of the feature. Roundness is the width of the zone that holds all sections
+    of a cylinder, each about a circle of its own, or all of a sphere: no section of either is
+    wider. Raises InputError for another feature or for too few points.
     """
     f = fit.feature
     wanted = {"flatness": "plane", "cylindricity": "cylinder", "roundness": "sphere or cylinder"}
     if f.kind not in wanted[kind].split(" or "):
         raise InputError(f"A {f.kind} has no {kind}: choose a {wanted[kind]}.")
     points = points[finite_rows(points)]
-    if kind == "roundness":
-        points, axis = _section_points(f, points)
-        normals = f.normals(points)
-        across = normals - (normals @ axis)[:, None] * axis
-        coordinates = unit_vectors(across)
-        # a circle: a thin section shows no tilt
-        fitted = np.column_stack([coordinates, np.ones(len(points))])
-        first = coordinates[0]
-        unrolled = np.arctan2(coordinates @ np.cross(axis, first), coordinates @ first)[:, None]
+    normals, fitted = f.normals(points), f.jacobian(points)
+    if f.kind == "plane":
+        coordinates = unrolled = _region_coordinates(points)
+    elif f.kind == "sphere":
+        coordinates = unrolled = normals
     else:
-        normals = f.normals(points)
-        coordinates = (
-            _region_coordinates(points) if f.kind == "plane" else _cylinder_coordinates(f, points)
-        )
-        fitted = f.jacobian(points)
-        unrolled = coordinates
-        if f.kind == "cylinder":
-            unrolled = np.column_stack(
-                [np.arctan2(coordinates[:, 1], coordinates[:, 0]), coordinates[:, 2]]
-            )
+        coordinates = _cylinder_coordinates(f, points)
+        around, along = coordinates[:, :2], coordinates[:, 2:]
+        unrolled = np.column_stack([np.arctan2(around[:, 1], around[:, 0]), along])
+        if kind == "roundness":  # each section has a circle of its own
+            circle = np.column_stack([around, np.ones(len(points))])
+            fitted = np.hstack([along**k * circle for k in range(DEGREE + 1)])
     smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted, unrolled)
     return zone_width(kind, smooth, shared)
 
@@ -550,15 +538,3 @@ def _cylinder_coordinates(f: Feature, points: Floats) -> Floats:
     return np.column_stack(
         [normals @ first, normals @ np.cross(axis, first), (along - middle) / half]
     )
-
-
-def _section_points(f: Feature, points: Floats) -> tuple[Floats, Floats]:
-    """The points of the section whose roundness is measured, and its normal (3,)."""
-    if f.kind == "cylinder":
-        axis = f.unit_direction
-        along = (points - f.place) @ axis
-        middle, reach = (along.max() + along.min()) / 2, SECTION_SHARE * float(np.ptp(along)) / 2
-        return points[np.abs(along - middle) <= reach], axis
-    towards = points.mean(axis=0) - f.place
-    axis = perpendicular_axes(towards)[0]
-    return points[np.abs((points - f.place) @ axis) <= SECTION_SHARE * (f.radius or 0.0)], axis

@@ -13,7 +13,7 @@ from slviewer.inspection.regions import Region
 
 NEIGHBOURS = 16
 """Points that a place on a measured feature has within the radius that is looked at."""
-MEASURED_SHARE, HOLE_SHARE = 1 / 3, 1 / 8
+MEASURED_SHARE, HOLE_SHARE = 1 / 4, 1 / 8
 """Of these: with fewer points of the feature, its surface is not measured there, but points that
 deviate and lie parallel to it are; with the lesser share also those that do not."""
 MIN_PARALLEL = 0.5
@@ -102,14 +102,16 @@ def find_members(
     radius = float(np.median(tree.query(sample, k=NEIGHBOURS)[0][:, -1]))
     measured = tree.query_ball_point(feet[far], radius, return_length=True) / NEIGHBOURS
     parallel = np.abs(np.sum(normals[far] * along[far], axis=1)) > MIN_PARALLEL
-    own = (measured <= MEASURED_SHARE) & parallel
-    own |= (measured <= HOLE_SHARE) & _fill_area(feet[far], radius)
-    own[own & ~inside[far]] = _are_surrounded(feet[far][own & ~inside[far]], tree, 3 * radius)
+    own = (measured <= MEASURED_SHARE) & parallel & inside[far]
+    is_hole = (measured <= HOLE_SHARE) & (parallel | _fill_area(feet[far], radius))
+    beyond = is_hole & ~inside[far]
+    is_hole[beyond] = _are_surrounded(feet[far][beyond], tree, 3 * radius)
+    own |= is_hole
     if camera is not None:
         facing = np.sum(along * (camera - feet), axis=1)
         side = np.sign(np.median(facing[is_near]))
         own &= side * facing[far] > 0
-    own[own] = _have_company(feet[far][own], distances[far][own], radius)
+    own = _spread_to_company(own, feet[far], distances[far], radius)
     membership.deviates[far] = own
     company = cKDTree(points[far]).query_ball_point(points[far], 2 * radius, return_length=True)
     membership.isolated[far] = ~own & (company <= LEAST_COMPANY)
@@ -127,15 +129,17 @@ def _are_surrounded(feet: Floats, near: cKDTree, reach: float) -> Mask:
     return surrounded
 
 
-def _have_company(feet: Floats, distances: Floats, radius: float) -> Mask:
-    """Which far points, with ``feet`` (n, 3) on the feature, have as many near ones at about their
-    own of the ``distances`` (n,) as a surface has: (n,) bool."""
+def _spread_to_company(own: Mask, feet: Floats, distances: Floats, radius: float) -> Mask:
+    """Which far points, with ``feet`` (n, 3) on the feature, are its ``own`` (n,), or next to such:
+    of those that have as many near ones at about their ``distances`` (n,) as a surface has."""
     if len(feet) < LEAST_ALIKE:
         return np.zeros(len(feet), bool)
     gaps, near = cKDTree(feet).query(feet, k=min(NEIGHBOURS, len(feet)))
     off = np.abs(distances[near] - distances[:, None])
     alike = (gaps <= radius) & (off <= ALIKE * np.abs(distances[:, None]))
-    return np.asarray(np.sum(alike, axis=1) >= LEAST_ALIKE)
+    is_surface = np.sum(alike, axis=1) >= LEAST_ALIKE
+    own = own & is_surface
+    return np.asarray(own | (is_surface & (alike & own[near]).any(axis=1)))
 
 
 def _fill_area(feet: Floats, radius: float) -> Mask:

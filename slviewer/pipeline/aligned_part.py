@@ -11,8 +11,9 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.evaluation.fit import MAX_SIGMA
 from slviewer.geometry.rigid import Floats, Uncertainty, move_points
 from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.inspection.deviation import NominalArea, judge_limits
-from slviewer.inspection.features import relation
+from slviewer.inspection.features import Feature, relation
 from slviewer.inspection.fitting import (
     FeatureFit,
     datum_frame,
@@ -34,12 +35,15 @@ from slviewer.pipeline.compare import fit_to_nominal
 from slviewer.pipeline.measure import MeasuredSurface
 from slviewer.records.inspection import Characteristic, CharacteristicResult
 from slviewer.records.measurement import Quantity
-from slviewer.session.inspection_plan import FORMS, SIZES, TO_DATUM, Plan
+from slviewer.session.inspection_plan import FORMS, SIZES, TO_DATUM, Plan, PlanFeature
 from slviewer.session.nominal import Nominal
 
 LEAST_REGION = 50.0
 """Percent of a feature's area in its region that a decision needs, where no nominal model tells
 whether the feature fills the region."""
+MAX_TURNED_DEG, MAX_OFF_RADIUS = 15.0, 0.4
+"""From the plan's direction, and from its place or radius as a share of that: a feature farther off
+is another."""
 DATUM_ROUNDS = 4
 """Fits of the datums, each with the regions moved by the frame of the last."""
 
@@ -124,8 +128,8 @@ class AlignedPart:
         if len(away):
             isolated = find_isolated(points, away, MAX_SIGMA * robust_sigma(away))
         beside = np.count_nonzero(inside[chosen] & ~own)
-        total = max(beside + len(away), 1)
-        reasons = {"on other surfaces": beside, "isolated": np.count_nonzero(isolated)}
+        total = max(int(beside) + len(away), 1)
+        reasons = {"on other surfaces": int(beside), "isolated": int(isolated.sum())}
         text = ", ".join(f"{100 * n / total:.2g} % {what}" for what, n in reasons.items() if n)
         excluded = 100 * sum(reasons.values()) / total
         return SurfacePoints(
@@ -209,10 +213,35 @@ class AlignedPart:
             fit = fit_feature(feature.kind, points, self.errors, feature.region, camera)
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
+        _refuse_unplanned(fit.feature, feature)
         towards = T[:3, 3] - fit.feature.place
         if as_planned and feature.direction is not None:
             towards = np.array(feature.direction)
         return face_towards(fit, towards)
+
+
+def _refuse_unplanned(found: Feature, planned: PlanFeature) -> None:
+    """Raise InputError where what was fitted is so far from the plan's feature that it is another
+    surface of the region."""
+    if planned.direction is not None and found.direction is not None:
+        cosine = abs(float(found.direction @ unit_vectors(np.array(planned.direction))))
+        if cosine < np.cos(np.radians(MAX_TURNED_DEG)):
+            raise InputError(
+                f"{planned.name}: the {found.kind} in its region is turned by"
+                f" {np.degrees(np.arccos(cosine)):.0f} degrees from the plan's: see that the part"
+                " has it there, and scan what is missing of it."
+            )
+    if planned.radius is None or found.radius is None:
+        return
+    off = abs(found.radius - planned.radius)
+    if planned.place is not None:
+        nominal = Feature(found.kind, np.array(planned.place), found.direction, 0.0)
+        off = max(off, abs(float(nominal.distance(found.place[None])[0])))
+    if off > MAX_OFF_RADIUS * planned.radius:
+        raise InputError(
+            f"{planned.name}: the {found.kind} in its region is {off:.3g} mm off the plan's in place"
+            " or radius: see that the part has it there, and scan what is missing of it."
+        )
 
 
 def mark_undecided(wanted: Characteristic, reason: str) -> CharacteristicResult:

@@ -403,11 +403,14 @@ def true_value(
 
 
 def _section_range(f: TrueFeature) -> float:
-    """The range of the distances from the best circle in the middle of a cylinder."""
-    along = (f.points - f.place) @ f.axis
-    near = np.abs(along - (along.max() + along.min()) / 2) <= 0.05 * np.ptp(along)
-    offsets = (f.points - f.place)[near]
-    c = offsets - (offsets @ f.axis)[:, None] * f.axis
+    """The largest range of the distances from the best circle of a section of a cylinder."""
+    offsets = f.points - f.place
+    along = offsets @ f.axis
+    c = offsets - along[:, None] * f.axis
     columns = np.hstack([c / np.linalg.norm(c, axis=1, keepdims=True), np.ones((len(c), 1))])
-    off = f.off[near]
-    return float(np.ptp(off - columns @ np.linalg.lstsq(columns, off, rcond=None)[0]))
+    section = np.minimum((along - along.min()) / np.ptp(along) * 20, 19).astype(int)
+    ranges = []
+    for k in range(20):
+        off, own = f.off[section == k], columns[section == k]
+        ranges.append(np.ptp(off - own @ np.linalg.lstsq(own, off, rcond=None)[0]))
+    return float(max(ranges))

@@ -140,10 +140,10 @@ def measure_part(part: FaultyPart, rng: Rng, points: int, noise: float, is_full:
         names.append(np.full(len(where), "clamp"))
         places.append(where)
         normals.append(facing)
-    name, clean, facing = map(np.concatenate, (names, places, normals))
+    owner, clean, facing = (np.concatenate(each) for each in (names, places, normals))
     if not is_full:
         seen = is_seen(mesh, camera, clean, facing)
-        name, clean, facing = name[seen], clean[seen], facing[seen]
+        owner, clean, facing = owner[seen], clean[seen], facing[seen]
     cloud = clean + noise * rng.normal(size=(len(clean), 1)) * facing
     wrong = rng.choice(len(cloud), int(rng.uniform(0.001, 0.005) * len(cloud)), replace=False)
     away = rng.normal(size=(len(wrong), 3))
@@ -160,7 +160,7 @@ def measure_part(part: FaultyPart, rng: Rng, points: int, noise: float, is_full:
         normals=(facing @ R.T).astype(np.float32) if rng.uniform() < 0.5 else None,
         views=() if is_full else (devices,),
     )
-    return Scene(surface, T, is_full, camera, mesh, name, clean)
+    return Scene(surface, T, is_full, camera, mesh, owner, clean)
 
 
 def _draw_clamp(part: FaultyPart, rng: Rng, points: int) -> tuple[Array, Array]:
@@ -210,8 +210,11 @@ def make_plan(part: FaultyPart, scene: Scene, rng: Rng, kind: str, nominal: Path
     if kind == "3-2-1":
         start = T @ np.linalg.inv(scene.T_camera_part)
         alignment = Alignment(
-            "3-2-1", None, ("base", "left", "front"), tuple(map(tuple, start.tolist()))
-        )  # type: ignore[arg-type]
+            "3-2-1",
+            None,
+            ("base", "left", "front"),
+            tuple(map(tuple, start.tolist())),  # type: ignore[arg-type]
+        )
     elif kind == "best fit":
         alignment = Alignment("best fit", str(nominal))
     return Plan("faults", tuple(features), tuple(_list_characteristics(part, kind)), alignment)
