@@ -14,6 +14,7 @@ never narrower than the minimum zones of ISO 1101.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Literal
 
@@ -62,6 +63,8 @@ BURN_IN, THINNING = 50, 3
 kept."""
 THIN = 0.01
 POINTS_PER_TERM = 10
+SECTIONS = 10
+"""Along a cylinder, of each of which the roundness is measured."""
 MAX_TILT_DEG = 10.0
 """Features farther from parallel or perpendicular than this are not meant to be so."""
 
@@ -134,7 +137,6 @@ def smooth_deviations(
             break
         chosen = [each[~isolated] for each in chosen]
     noise = float(np.sqrt(residuals @ residuals / (n - columns)))
-    fine = _find_fine(points, residuals)
     factor = _patch_misfit(residuals, coordinates, noise, columns)
     sampled = np.arange(0, n, -(-n // MAX_SHARED_POINTS))
     answer = np.linalg.pinv(whole[sampled], rcond=1e-6)
@@ -146,14 +148,16 @@ def smooth_deviations(
     form = weights[removed.shape[1] :]
     draws = np.repeat(weights[:, None], DRAWS, axis=1)
     draws[removed.shape[1] :] = _draw_weights(form, degrees, noise, np.random.default_rng(0))
+    # what shrinking takes for noise is form where neighbours agree on it
+    fine = _find_fine(points, d - whole @ draws.mean(axis=1), robust_sigma(residuals))
     is_noise = not fine.any() and bool(
         form @ form <= noise**2 * chdtri(max(len(form), 1), 1 - LEVEL)
     )
     return SmoothDeviations(points, normals, smooth, draws, is_noise, noise, fine, answer, sampled)
 
 
-def _range(deviations: Floats) -> Floats:
-    """Return the range of deviations (n, draws) in each draw."""
+def _range(deviations: Floats, points: Floats) -> Floats:
+    """Return the range of deviations (n, draws) in each draw; the ``points`` do not matter."""
     return np.ptp(deviations, axis=0)
 
 
@@ -162,11 +166,11 @@ def zone_width(
     smooth: SmoothDeviations,
     shared: Shared | None,
     displaced: Callable[[Floats, Floats], Floats] | None = None,
-    width: Callable[[Floats], Floats] = _range,
+    width: Callable[[Floats, Floats], Floats] = _range,
 ) -> Quantity:
     """The width (mm) of a zone that holds the smooth part, with the spread of its draws in U.
 
-    ``width``: of deviations (n, draws), for each draw; ``displaced``: draws of further deviations
+    ``width``: of deviations (n, draws) at points (n, 3), for each draw; ``displaced``: draws of further deviations
     (n, draws) at points (n, 3) with normals (n, 3), as a datum's or an alignment's errors cause.
     """
     field = smooth.smooth
@@ -176,7 +180,8 @@ def zone_width(
     drawn = smooth.basis[chosen] @ smooth.draws + smooth.fine[chosen, None]
     if displaced is not None:
         drawn = drawn + displaced(smooth.points[chosen], smooth.normals[chosen])
-    widths, value = width(drawn), float(width(field[:, None])[0])
+    widths = width(drawn, smooth.points[chosen])
+    value = float(width(field[:, None], smooth.points)[0])
     variance = float(widths.var()) + (FINE_SHARE * float(np.abs(smooth.fine).max())) ** 2
     if shared is not None:
         # where the zone touches, its width answers to the deviations there; the rest of the field
@@ -187,7 +192,7 @@ def zone_width(
         signs = np.sign(field[ends] - np.median(field))
         moved = np.repeat(field[:, None], 2, axis=1)
         moved[ends, [0, 1]] += signs * change
-        by_field[ends] = (width(moved) - value) / change * signs
+        by_field[ends] = (width(moved, smooth.points) - value) / change * signs
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
         effects = shared(smooth.points[places], answers[None, :, None] * smooth.normals[places])
@@ -205,9 +210,8 @@ def form_error(
 ) -> Quantity:
     """Flatness of a plane, cylindricity of a cylinder, roundness of a cylinder or a sphere, mm.
 
-    ``points`` (n, 3) mm: of the feature. Roundness is the width of the zone that holds all sections
-    of a cylinder, each about a circle of its own, or all of a sphere: no section of either is
-    wider. Raises InputError for another feature or for too few points.
+    ``points`` (n, 3) mm: of the feature. Roundness is that of the worst section of a cylinder; of a
+    sphere the width of the zone that holds all of it: no section is wider. Raises InputError for another feature or for too few points.
     """
     f = fit.feature
     wanted = {"flatness": "plane", "cylindricity": "cylinder", "roundness": "sphere or cylinder"}
@@ -223,11 +227,23 @@ def form_error(
         coordinates = _cylinder_coordinates(f, points)
         around, along = coordinates[:, :2], coordinates[:, 2:]
         unrolled = np.column_stack([np.arctan2(around[:, 1], around[:, 0]), along])
-        if kind == "roundness":  # each section has a circle of its own
-            circle = np.column_stack([around, np.ones(len(points))])
-            fitted = np.hstack([along**k * circle for k in range(DEGREE + 1)])
     smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted, unrolled)
+    if kind == "roundness" and f.kind == "cylinder":
+        return zone_width(kind, smooth, shared, width=partial(_section_range, f))
     return zone_width(kind, smooth, shared)
+
+
+def _section_range(f: Feature, deviations: Floats, points: Floats) -> Floats:
+    """Return the largest range of deviations (n, draws) at points (n, 3) from the circle of a
+    section of a cylinder, of `SECTIONS` along it, in each draw."""
+    coordinates = _cylinder_coordinates(f, points)
+    section = np.minimum((coordinates[:, 2] + 1) / 2 * SECTIONS, SECTIONS - 1).astype(int)
+    circle = np.column_stack([coordinates[:, :2], np.ones(len(points))])
+    ranges = [np.zeros(deviations.shape[1])]
+    for k in np.unique(section):
+        own, columns = deviations[section == k], circle[section == k]
+        ranges.append(_range(own - columns @ np.linalg.lstsq(columns, own, rcond=None)[0], points))
+    return np.asarray(np.max(ranges, axis=0))
 
 
 def orientation_error(
@@ -364,8 +380,9 @@ def profile_error(
     return zone_width("profile", smooth, shared, displaced, _twice_largest)
 
 
-def _twice_largest(deviations: Floats) -> Floats:
-    """Return twice the largest size of deviations (n, draws) in each draw."""
+def _twice_largest(deviations: Floats, points: Floats) -> Floats:
+    """Return twice the largest size of deviations (n, draws) in each draw; the ``points`` do not
+    matter."""
     return 2 * np.abs(deviations).max(axis=0)
 
 
@@ -485,10 +502,10 @@ def _even_weights(unrolled: Floats) -> Floats:
     return occupied[place] / sums[place]
 
 
-def _find_fine(points: Floats, residuals: Floats) -> Floats:
+def _find_fine(points: Floats, residuals: Floats, sigma: float) -> Floats:
     """Mean residuals (n,) mm of each point's neighbours where noise does not explain them, else 0:
-    the largest of those of `FINE_POINTS` neighbours."""
-    fine, sigma = np.zeros(len(points)), robust_sigma(residuals)
+    the largest of those of `FINE_POINTS` neighbours. ``sigma``: the noise, mm."""
+    fine = np.zeros(len(points))
     if not sigma > 1e-9 * float(np.abs(points).max()):
         return fine
     _, near = cKDTree(points).query(points, k=min(max(FINE_POINTS), len(points)))

@@ -16,8 +16,9 @@ NEIGHBOURS = 16
 MEASURED_SHARE, HOLE_SHARE = 1 / 4, 1 / 8
 """Of these: with fewer points of the feature, its surface is not measured there, but points that
 deviate and lie parallel to it are; with the lesser share also those that do not."""
-MIN_PARALLEL = 0.5
-"""Cosine between the normal of the feature and that of a surface that may be its own."""
+MIN_PARALLEL, SAME_COSINE = 0.5, 0.8
+"""Cosine between the normal of the feature and that of a surface that may be its own; of one that
+is, where hardly anything else was measured: neighbours at an edge mix the normals of both sides."""
 LEAST_COMPANY = 3
 """Of a point's eight neighbours that deviate alike: with fewer it is isolated."""
 ALIKE, LEAST_ALIKE = 0.5, 6
@@ -64,9 +65,8 @@ def find_isolated(points: Floats, residuals: Floats, reach: float) -> Mask:
     """Which points (n, 3) lie farther than ``reach`` mm off by ``residuals`` (n,), without
     neighbours that deviate alike: (n,) bool."""
     is_far = np.abs(residuals) > reach
-    isolated = is_far.copy()
-    if is_far.any():
-        count = min(9, len(points))
+    isolated, count = is_far.copy(), min(9, len(points))
+    if is_far.any() and count > 1:
         _, near = cKDTree(points).query(points[is_far], k=count)
         alike = np.sign(residuals) * is_far
         company = np.sum(alike[near[:, 1:]] == alike[is_far][:, None], axis=1)
@@ -101,10 +101,12 @@ def find_members(
     sample = feet[is_near][:: max(1, len(tree.data) // 1000)]
     radius = float(np.median(tree.query(sample, k=NEIGHBOURS)[0][:, -1]))
     measured = tree.query_ball_point(feet[far], radius, return_length=True) / NEIGHBOURS
-    parallel = np.abs(np.sum(normals[far] * along[far], axis=1)) > MIN_PARALLEL
+    parallel = np.abs(np.sum(normals[far] * along[far], axis=1)) > SAME_COSINE
     own = (measured <= MEASURED_SHARE) & parallel & inside[far]
     is_hole = (measured <= HOLE_SHARE) & (parallel | _fill_area(feet[far], radius))
     beyond = is_hole & ~inside[far]
+    is_hole[beyond] &= measured[beyond] == 0
+    beyond &= is_hole
     is_hole[beyond] = _are_surrounded(feet[far][beyond], tree, 3 * radius)
     own |= is_hole
     if camera is not None:

@@ -239,7 +239,7 @@ def _refuse_unplanned(found: Feature, planned: PlanFeature) -> None:
         off = max(off, abs(float(nominal.distance(found.place[None])[0])))
     if off > MAX_OFF_RADIUS * planned.radius:
         raise InputError(
-            f"{planned.name}: the {found.kind} in its region is {off:.3g} mm off the plan's in place"
+            f"{planned.name}: the {found.kind} in its region is {off:.3g} mm off the plan's place"
             " or radius: see that the part has it there, and scan what is missing of it."
         )
 

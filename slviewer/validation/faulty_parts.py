@@ -369,37 +369,41 @@ def true_value(
     """The true value of a characteristic of features ``found``, in part coordinates."""
     f: TrueFeature = found[names[0]]
     d: TrueFeature = found[names[-1]]
+    if len(names) == 2:
+        return _true_relation(kind, f, d)
     patch = part.patches[names[0]]
-    if kind in ("flatness", "cylindricity"):
-        return float(np.ptp(f.off))
     if kind == "diameter":
         return 2 * f.radius
-    if kind == "roundness":
-        return float(np.ptp(f.off)) if f.kind == "sphere" else _section_range(f)
-    if kind == "profile" or (kind == "position" and f.kind == "plane"):
+    if kind == "roundness" and f.kind == "cylinder":
+        return _section_range(f)
+    if kind in ("flatness", "cylindricity", "roundness"):
+        return float(np.ptp(f.off))
+    if kind == "profile" or f.kind == "plane":
         return 2 * float(np.abs(nominal_distance(patch, f.points)[0]).max())
-    if kind == "position":
-        places = f.place[None] if f.kind == "sphere" else f.ends()
-        offsets = places - patch.origin
-        if f.kind == "cylinder":
-            offsets = offsets - (offsets @ patch.axes[2])[:, None] * patch.axes[2]
-        return 2 * float(np.linalg.norm(offsets, axis=1).max())
+    places = f.place[None] if f.kind == "sphere" else f.ends()
+    offsets = places - patch.origin
+    if f.kind == "cylinder":
+        offsets = offsets - (offsets @ patch.axes[2])[:, None] * patch.axes[2]
+    return 2 * float(np.linalg.norm(offsets, axis=1).max())
+
+
+def _true_relation(kind: str, f: TrueFeature, d: TrueFeature) -> float:
+    """The true value of a characteristic of a feature to a datum."""
+    if kind in ("parallelism", "perpendicularity") and f.kind == "cylinder":
+        length = float(np.linalg.norm(np.diff(f.ends(), axis=0)))
+        return length * float(np.linalg.norm(np.cross(f.axis, d.axis)))
     if kind in ("parallelism", "perpendicularity"):
-        if f.kind == "cylinder":
-            length = float(np.linalg.norm(np.diff(f.ends(), axis=0)))
-            return length * float(np.linalg.norm(np.cross(f.axis, d.axis)))
         n = d.axis if kind == "parallelism" else f.axis - (f.axis @ d.axis) * d.axis
         return float(np.ptp(f.points @ (n / np.linalg.norm(n))))
+    apart = d.place - f.place
     if kind == "distance":
-        return 0.5 * float(abs((f.place - d.place) @ d.axis) + abs((d.place - f.place) @ f.axis))
+        return 0.5 * float(abs(apart @ d.axis) + abs(apart @ f.axis))
     if kind == "angle":
         return float(np.degrees(np.arccos(min(abs(f.axis @ d.axis), 1.0))))
     if kind == "height of the centre":
-        return float((d.place - f.place) @ f.axis)
-    return 0.5 * float(  # of nearly parallel axes
-        np.linalg.norm(np.cross(d.place - f.place, f.axis))
-        + np.linalg.norm(np.cross(d.place - f.place, d.axis))
-    )
+        return float(apart @ f.axis)
+    # of nearly parallel axes
+    return 0.5 * float(sum(np.linalg.norm(np.cross(apart, each.axis)) for each in (f, d)))
 
 
 def _section_range(f: TrueFeature) -> float:

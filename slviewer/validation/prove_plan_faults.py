@@ -167,8 +167,8 @@ def _draw_clamp(part: FaultyPart, rng: Rng, points: int) -> tuple[Array, Array]:
     """Points of a small box beside the pin, the hole, the dome or the block, and their normals."""
     patch = part.patches[str(rng.choice(["pin", "hole", "dome", "block"]))]
     r, half = abs(patch.size[0]), part.size_mm / 40
-    angle = rng.uniform(0, 2 * np.pi)
-    gap = r * (1.45 if patch.name == "block" else 1.0) + rng.uniform(1.6, 2.5) * half
+    angle = np.pi / 2 * rng.integers(4)  # on the feature's own tile, and beside no other
+    gap = rng.uniform(r + 1.3 * half, max(r + 1.4 * half, part.size_mm / 6 - half))
     middle = np.r_[patch.origin[:2] + gap * np.array([np.cos(angle), np.sin(angle)]), 2 * half]
     count = points // 60
     local, normals = rng.uniform(-1, 1, (count, 3)), np.zeros((count, 3))
@@ -268,38 +268,57 @@ def run_case(seed: int) -> list[PlanCase]:
         plan = make_plan(part, scene, rng, kind, nominal)
         inspection = inspect_surfaces(plan, [("part", lambda report: scene.surface)])
     truths = [_fit_all(part, scene, kind, only_seen) for only_seen in (False, True)]
-    cases = []
-    for wanted, result in zip(plan.characteristic, inspection.parts[0].results, strict=True):
-        names = tuple(name.removesuffix(" surface") for name in wanted.features)
-        values = [_value_of(wanted.kind, names, part, found) for found in truths]
-        limit = t * (2 if wanted.upper is not None and wanted.upper > 1.5 * t else 1)
-        inside = [_is_inside(value, wanted) for value in values]
-        truth: Truth = "unclear"
-        if all(inside):
-            truth = "right"
-        elif not any(inside):
-            truth = "wrong"
-        off = _deviation(values[0], wanted)
-        is_dense = all(np.sum(scene.names == n) >= ENOUGH[part.patches[n].kind] for n in names)
-        is_local = part.fault.kind in ("dent", "burr", "flat") and part.fault.feature in names
-        own = part.fault.feature in names
-        cases.append(
-            PlanCase(
-                seed,
-                wanted.kind,
-                " ".join(names),
-                part.fault.kind if own or part.fault.kind == "shrunk" else "elsewhere",
-                part.fault.tolerances,
-                "full" if is_full else "one side",
-                kind,
-                truth,
-                values[0],
-                wanted.upper if wanted.upper is not None else limit,
-                is_full and is_dense and share < 0.2 and off <= CLEAR and not is_local,
-                result,
-            )
-        )
-    return cases
+    setup = _Setup(seed, "full" if is_full else "one side", kind, share)
+    return [
+        _judge(setup, part, scene, wanted, result, truths)
+        for wanted, result in zip(plan.characteristic, inspection.parts[0].results, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """Of a part: its ``seed``, view and alignment, and ``noise`` as a share of the tolerance."""
+
+    seed: int
+    view: str
+    alignment: str
+    noise: float
+
+
+def _judge(
+    setup: _Setup,
+    part: FaultyPart,
+    scene: Scene,
+    wanted: Characteristic,
+    result: CharacteristicResult,
+    truths: Sequence[dict[str, Any]],
+) -> PlanCase:
+    """Compare one verdict with its truths, of all of the part and of what is seen."""
+    fault, names = part.fault, tuple(name.removesuffix(" surface") for name in wanted.features)
+    values = [_value_of(wanted.kind, names, part, found) for found in truths]
+    inside = [_is_inside(value, wanted) for value in values]
+    truth: Truth = "unclear"
+    if inside[0] == inside[1]:
+        truth = "right" if inside[0] else "wrong"
+    own = fault.feature in names
+    is_local = own and fault.kind in ("dent", "burr", "flat")
+    is_dense = all(np.sum(scene.names == n) >= ENOUGH[part.patches[n].kind] for n in names)
+    off = _deviation(values[0], wanted)
+    assert wanted.upper is not None
+    return PlanCase(
+        setup.seed,
+        wanted.kind,
+        " ".join(names),
+        fault.kind if own or fault.kind == "shrunk" else "elsewhere",
+        fault.tolerances,
+        setup.view,
+        setup.alignment,
+        truth,
+        values[0],
+        wanted.upper,
+        scene.is_full and is_dense and setup.noise < 0.2 and off <= CLEAR and not is_local,
+        result,
+    )
 
 
 def _deviation(value: float, wanted: Characteristic) -> float:
