@@ -170,8 +170,9 @@ def zone_width(
 ) -> Quantity:
     """The width (mm) of a zone that holds the smooth part, with the spread of its draws in U.
 
-    ``width``: of deviations (n, draws) at points (n, 3), for each draw; ``displaced``: draws of further deviations
-    (n, draws) at points (n, 3) with normals (n, 3), as a datum's or an alignment's errors cause.
+    ``width``: of deviations (n, draws) at points (n, 3), for each draw; ``displaced``: draws of
+    further deviations (n, draws) at points (n, 3) with normals (n, 3), as a datum's or an
+    alignment's errors cause.
     """
     field = smooth.smooth
     chosen = np.unique(
@@ -211,7 +212,8 @@ def form_error(
     """Flatness of a plane, cylindricity of a cylinder, roundness of a cylinder or a sphere, mm.
 
     ``points`` (n, 3) mm: of the feature. Roundness is that of the worst section of a cylinder; of a
-    sphere the width of the zone that holds all of it: no section is wider. Raises InputError for another feature or for too few points.
+    sphere the width of the zone that holds all of it: no section is wider. Raises InputError for
+    another feature or for too few points.
     """
     f = fit.feature
     wanted = {"flatness": "plane", "cylindricity": "cylinder", "roundness": "sphere or cylinder"}

@@ -132,16 +132,17 @@ def _are_surrounded(feet: Floats, near: cKDTree, reach: float) -> Mask:
 
 
 def _spread_to_company(own: Mask, feet: Floats, distances: Floats, radius: float) -> Mask:
-    """Which far points, with ``feet`` (n, 3) on the feature, are its ``own`` (n,), or next to such:
-    of those that have as many near ones at about their ``distances`` (n,) as a surface has."""
+    """Which far points, with ``feet`` (n, 3) on the feature, are its ``own`` (n,), of those that
+    have as many near ones at about their ``distances`` (n,) as a surface has; and those next to
+    them that lie between them and the feature."""
     if len(feet) < LEAST_ALIKE:
         return np.zeros(len(feet), bool)
     gaps, near = cKDTree(feet).query(feet, k=min(NEIGHBOURS, len(feet)))
-    off = np.abs(distances[near] - distances[:, None])
-    alike = (gaps <= radius) & (off <= ALIKE * np.abs(distances[:, None]))
-    is_surface = np.sum(alike, axis=1) >= LEAST_ALIKE
-    own = own & is_surface
-    return np.asarray(own | (is_surface & (alike & own[near]).any(axis=1)))
+    d, around = distances[:, None], distances[near]
+    alike = (gaps <= radius) & (np.abs(around - d) <= ALIKE * np.abs(d))
+    own = own & (np.sum(alike, axis=1) >= LEAST_ALIKE)
+    is_between = (gaps <= radius) & (around * d > 0) & (np.abs(around) >= np.abs(d))
+    return np.asarray(own | (is_between & own[near]).any(axis=1))
 
 
 def _fill_area(feet: Floats, radius: float) -> Mask:

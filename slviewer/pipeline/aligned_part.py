@@ -41,7 +41,7 @@ from slviewer.session.nominal import Nominal
 LEAST_REGION = 50.0
 """Percent of a feature's area in its region that a decision needs, where no nominal model tells
 whether the feature fills the region."""
-MAX_TURNED_DEG, MAX_OFF_RADIUS = 15.0, 0.4
+MAX_TURNED_DEG, MAX_OFF_RADIUS = 20.0, 0.4
 """From the plan's direction, and from its place or radius as a share of that: a feature farther off
 is another."""
 DATUM_ROUNDS = 4
