@@ -61,7 +61,7 @@ class SurfacePoints:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PlanEvidence:
     """As the fields of `CharacteristicResult`."""
 
     measured: float | None
@@ -136,7 +136,7 @@ class AlignedPart:
             points[~isolated], away[~isolated], towards[~isolated], float(excluded), text
         )
 
-    def evidence(self, names: Sequence[str]) -> Evidence:
+    def evidence(self, names: Sequence[str]) -> PlanEvidence:
         """The evidence on features: the least share measured, the largest that is excluded, and the
         smallest defect that the first would show."""
         measured = [self.percent_measured(name) for name in names]
@@ -154,7 +154,7 @@ class AlignedPart:
                 excluded.append((share, fit.excluded_as))
             smallest.append(smallest_defect(points, deviations))
         share, text = max(excluded)
-        return Evidence(min(known, default=None), share, text, smallest[0])
+        return PlanEvidence(min(known, default=None), share, text, smallest[0])
 
     def doubts(self, names: Sequence[str]) -> list[str]:
         """Return the warnings about the scan and the fits of features."""

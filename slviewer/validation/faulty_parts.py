@@ -111,7 +111,7 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class Fault:
+class PartFault:
     """A fault of one ``feature``: ``kind``, its size in ``tolerances`` and mm, and where it is:
     ``centre`` (u, v) and ``radius`` mm of what is local, ``direction`` (3,) of what is moved."""
 
@@ -151,7 +151,7 @@ class FaultyPart:
 
     patches: Mapping[str, Patch]
     replaced: Mapping[str, Patch]
-    fault: Fault
+    fault: PartFault
     size_mm: float
     tolerance_mm: float
 
@@ -225,7 +225,7 @@ def draw_part(rng: Rng, points: int) -> FaultyPart:
     return FaultyPart(patches, floor, _draw_fault(rng, patches, t, points), S, t)
 
 
-def _draw_fault(rng: Rng, patches: Mapping[str, Patch], tolerance: float, points: int) -> Fault:
+def _draw_fault(rng: Rng, patches: Mapping[str, Patch], tolerance: float, points: int) -> PartFault:
     """Draw a fault, whose local ones some thirty points show at least."""
     name = str(rng.choice(["block", "pin", "hole", "dome", "left"]))
     patch = patches[name]
@@ -238,7 +238,7 @@ def _draw_fault(rng: Rng, patches: Mapping[str, Patch], tolerance: float, points
     if patch.kind == "sphere":
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
-    return Fault(
+    return PartFault(
         name,
         kind,
         size,
@@ -308,12 +308,12 @@ def fit_true(patch: Patch, points: Array, axis: Array) -> TrueFeature:
     return TrueFeature(kind, points, place, n, float(p[5]), found.fun)
 
 
-def move(T: Array, points: Array) -> Array:
+def move_by(T: Array, points: Array) -> Array:
     """Points (n, 3) moved by T (4, 4)."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
-def datum_frame(features: Mapping[str, TrueFeature]) -> Array:
+def true_datum_frame(features: Mapping[str, TrueFeature]) -> Array:
     """The motion (4, 4) into the frame of the datums base, left and front, as in the plan."""
     z = features["base"].axis
     x = features["left"].axis - (features["left"].axis @ z) * z
@@ -335,7 +335,7 @@ def best_fit(part: FaultyPart, names: Array, places: Array) -> Array:
     for _ in range(4):
         rows, away = [], []
         for name, patch in part.patches.items():
-            own = move(T, places[names == name])
+            own = move_by(T, places[names == name])
             if not len(own):
                 continue
             d, n = nominal_distance(patch, own)
@@ -402,7 +402,10 @@ def _true_relation(kind: str, f: TrueFeature, d: TrueFeature) -> float:
         return float(np.degrees(np.arccos(min(abs(f.axis @ d.axis), 1.0))))
     if kind == "height of the centre":
         return float(apart @ f.axis)
-    # of nearly parallel axes
+    across = np.cross(f.axis, d.axis)
+    if np.linalg.norm(across) > np.sin(np.radians(5)):
+        return float(abs(apart @ across) / np.linalg.norm(across))
+    # in the middle of nearly parallel ones
     return 0.5 * float(sum(np.linalg.norm(np.cross(apart, each.axis)) for each in (f, d)))
 
 
