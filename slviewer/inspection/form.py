@@ -167,12 +167,14 @@ def zone_width(
     shared: Shared | None,
     displaced: Callable[[Floats, Floats], Floats] | None = None,
     width: Callable[[Floats, Floats], Floats] = _range,
+    is_worst: bool = False,
 ) -> Quantity:
     """The width (mm) of a zone that holds the smooth part, with the spread of its draws in U.
 
     ``width``: of deviations (n, draws) at points (n, 3), for each draw; ``displaced``: draws of
     further deviations (n, draws) at points (n, 3) with normals (n, 3), as a datum's or an
-    alignment's errors cause.
+    alignment's errors cause. ``is_worst``: the width is that of the worst of several zones, whose
+    noise it picks out: as much as the draws add is subtracted.
     """
     field = smooth.smooth
     chosen = np.unique(
@@ -200,7 +202,10 @@ def zone_width(
         variance += float(np.sum(effects**2))
     # what the draws' scatter adds to the width bounds by how much the mean's own scatter may have
     # widened it
-    sigma = float(np.sqrt(variance + (widths.mean() - value) ** 2 / 3))
+    added = float(widths.mean()) - value
+    sigma = float(np.sqrt(variance + added**2 / 3))
+    if is_worst:
+        value -= min(max(added, 0.0), value)
     return Quantity(
         name, value, "mm", max(sigma, value / 2) if smooth.is_noise else sigma, shared is not None
     )
@@ -231,7 +236,7 @@ def form_error(
         unrolled = np.column_stack([np.arctan2(around[:, 1], around[:, 0]), along])
     smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted, unrolled)
     if kind == "roundness" and f.kind == "cylinder":
-        return zone_width(kind, smooth, shared, width=partial(_section_range, f))
+        return zone_width(kind, smooth, shared, width=partial(_section_range, f), is_worst=True)
     return zone_width(kind, smooth, shared)
 
 

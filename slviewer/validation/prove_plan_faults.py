@@ -309,9 +309,6 @@ def _judge(
     if len(set(inside)) == 1 and not (wanted.kind == "profile" and hidden & {*wanted.features}):
         truth = "right" if inside[0] else "wrong"
     own = fault.feature in names
-    is_local = own and fault.kind in ("dent", "burr", "flat")
-    is_dense = all(np.sum(scene.names == n) >= ENOUGH[part.patches[n].kind] for n in names)
-    off = _deviation(values[0], wanted)
     assert wanted.upper is not None
     return PlanCase(
         setup.seed,
@@ -324,9 +321,19 @@ def _judge(
         truth,
         values[0],
         wanted.upper,
-        scene.is_full and is_dense and setup.noise < 0.2 and off <= CLEAR and not is_local,
+        _is_clear(part, scene, setup, names, _deviation(values[0], wanted)),
         result,
     )
+
+
+def _is_clear(
+    part: FaultyPart, scene: MeasuredPart, setup: _Setup, names: Sequence[str], off: float
+) -> bool:
+    """Whether a right characteristic, ``off`` by a share of its tolerance, must be decided."""
+    if part.fault.feature in names and part.fault.kind in ("dent", "burr", "flat"):
+        return False
+    is_dense = all(np.sum(scene.names == n) >= ENOUGH[part.patches[n].kind] for n in names)
+    return scene.is_full and is_dense and setup.noise < 0.2 and off <= CLEAR
 
 
 def _deviation(value: float, wanted: Characteristic) -> float:
