@@ -568,11 +568,14 @@ def inspection_html(run: Stored[Inspection]) -> Html:
 
 
 def format_result(wanted: Characteristic, result: CharacteristicResult) -> Html:
-    """Return a value with its uncertainty and unit; a dash where it was not measured."""
+    """Return a value with its uncertainty and unit, and the evidence; a dash where it was not
+    measured."""
     if result.value is None:
         return coloured("–", "dim")
     uncertainty = "" if result.U is None else f" ± {result.U:.3f}"
-    return coloured(f"{result.value:.3f}{uncertainty} {wanted.unit}", "plain")
+    value = coloured(f"{result.value:.3f}{uncertainty} {wanted.unit}", "plain")
+    evidence = result.evidence
+    return Html(f"{value}<br>{coloured(evidence, 'dim')}") if evidence else value
 
 
 def format_limits(wanted: Characteristic) -> Html:

@@ -18,6 +18,7 @@ from slviewer.geometry.shapes import Plane, ransac_plane
 from slviewer.geometry.vectors import occupied_cubes, subsample, unit_vectors
 from slviewer.inspection.nominal_surface import MIN_NORMAL_COSINE, NominalSurface
 from slviewer.records.measurement import ExcludedPoints, Exclusion
+from slviewer.records.record import to_vector
 from slviewer.surface.shapes import extent_across, label_connected
 
 NOISE = 4.0
@@ -242,4 +243,4 @@ def _describe(reason: Exclusion, points: Floats) -> ExcludedPoints:
     """Return how many points (n, 3) are excluded, and where they are."""
     middle = np.median(points, axis=0)
     across = 0.0 if reason in ("alone", "border") else extent_across(points)
-    return ExcludedPoints(reason, len(points), (*map(float, middle),), across)
+    return ExcludedPoints(reason, len(points), to_vector(middle), across)

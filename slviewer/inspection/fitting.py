@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance import narrowest_range
-from slviewer.evaluation.fit import MAX_SIGMA, fit_settled, within_sigmas
+from slviewer.evaluation.fit import MAX_SIGMA, fit_settled
 from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import Floats, Uncertainty, move_points, rigid_transform
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
@@ -27,6 +27,8 @@ from slviewer.geometry.vectors import (
     unit_vectors,
 )
 from slviewer.inspection.features import Feature, Kind, perpendicular_axes
+from slviewer.inspection.membership import MIN_PARALLEL, Membership, find_members
+from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import PointErrors, Spread, scatter_covariance
 from slviewer.reconstruction.axis_agreement import RAISED_RATIO
 from slviewer.reconstruction.rig_change import bound_change
@@ -152,8 +154,9 @@ MAX_RADIUS_SIGMA = 0.1
 class FeatureFit:
     """A fitted feature and its residuals, mm.
 
-    ``rms`` and ``maximum`` (signed, the one farthest off) over the points used; ``form``: width of
-    the narrowest range that holds 95 % of their deviations; ``used`` and ``left_out`` count points;
+    ``points`` (n, 3): those that belong to it; ``rms`` and ``maximum`` (signed, the one farthest
+    off) are of these; ``form``: width of the narrowest range that holds 95 % of their deviations.
+    ``excluded`` counts the other points of the region, and ``excluded_as`` tells what they are;
     ``warnings``: sentences.
     """
 
@@ -162,9 +165,15 @@ class FeatureFit:
     rms: float
     maximum: float
     form: float
-    used: int
-    left_out: int
+    points: Floats
+    excluded: int
+    excluded_as: str = ""
     warnings: tuple[str, ...] = ()
+
+    @property
+    def used(self) -> int:
+        """Number of the points that belong to the feature."""
+        return len(self.points)
 
     def quantities(self) -> list[Quantity]:
         """Return radius, diameter, form error and residuals of the feature, with uncertainties
@@ -186,20 +195,31 @@ class FeatureFit:
         return size + listed
 
 
-def fit_feature(kind: Kind, points: np.ndarray, errors: PointErrors = NO_ERRORS) -> FeatureFit:
-    """The shape of a region's points (n, 3) mm, by least squares of the distances, outliers
-    excluded.
+def fit_feature(
+    kind: Kind,
+    points: np.ndarray,
+    errors: PointErrors = NO_ERRORS,
+    region: Region | None = None,
+    camera: Floats | None = None,
+) -> FeatureFit:
+    """The shape of a region's points (n, 3) mm, by least squares of the distances, without those
+    that lie beside it or are isolated.
 
     ``errors``: of the points; changes of the rig are part of the uncertainty where the axes of the
-    scan, or the residuals, show more than is predicted. Raises InputError where the region does not
-    hold the shape.
+    scan, or the residuals, show more than is predicted. What deviates over the shape's own area is
+    part of it too: by as much as it would move the fit. ``region``: of its points, where there are
+    others around it: those beyond it that lie over its part of the shape deviate from that.
+    ``camera`` (3,) mm: as in `find_members`. Raises InputError where the region does not hold the
+    shape.
     """
     points = np.asarray(points, np.float64)
     points = points[finite_rows(points)]
+    inside = np.ones(len(points), bool) if region is None else region.within(points)
+    around, points = points[~inside], points[inside]
     if len(points) < LEAST_POINTS:
         raise InputError(
-            f"The region holds {len(points)} measured points: a {kind} needs {LEAST_POINTS}; select"
-            " a wider region."
+            f"The region holds {len(points)} measured points: a {kind} needs {LEAST_POINTS}; see"
+            " that the part has it there, and scan it again or merge scans that show more of it."
         )
     if kind == "point":
         raise InputError("A point is picked, not fitted: fit a plane, a sphere or a cylinder.")
@@ -208,36 +228,108 @@ def fit_feature(kind: Kind, points: np.ndarray, errors: PointErrors = NO_ERRORS)
         feature, inliers = _fit_robustly(kind, sampled)
     except InputError as error:
         raise _describe_alternative(kind, sampled, error) from error
-    residuals = feature.distance(points)
-    counted = within_sigmas(residuals, points)
-    used = int(np.count_nonzero(counted))
-    excluded_share = 1 - used / len(points)
-    if excluded_share > MAX_EXCLUDED_SHARE:
+    every = np.vstack([points, around])
+    if inliers.all() and not len(around):
+        basis, membership = sampled, None
+    else:
+        normals = local_normals(every, every)
+        feature, basis = _refit_parallel(kind, feature, sampled[inliers], points, normals)
+        reach = max(MAX_SIGMA * robust_sigma(feature.distance(basis)), 1e-9 * np.abs(every).max())
+        over = np.ones(len(every), bool)
+        if region is not None:
+            feet = every - feature.distance(every)[:, None] * feature.normals(every)
+            over = region.within(feet)
+            over[: len(points)] = True
+        every, normals = every[over], normals[over]
+        is_near = np.abs(feature.distance(every)) <= reach
+        is_near[len(points) :] = False
+        inside = np.arange(len(every)) < len(points)
+        membership = find_members(feature, every, normals, is_near, inside, camera)
+    return _describe_fit(feature, basis, every, len(points), membership, errors)
+
+
+def _refit_parallel(
+    kind: Kind, feature: Feature, inliers: Floats, points: Floats, normals: Floats
+) -> tuple[Feature, Floats]:
+    """Fit a feature again to the points (n, 3) of a region whose ``normals`` are about its own;
+    also returns the points that it was fitted to. What meets it at an edge otherwise biases it."""
+    own = normals[: len(points)]
+    parallel = points[np.abs(np.sum(own * feature.normals(points), axis=1)) > MIN_PARALLEL]
+    if len(parallel) < max(LEAST_POINTS, (1 - MAX_EXCLUDED_SHARE) * len(inliers)):
+        return feature, inliers
+    parallel = subsample(parallel, MAX_FITTED_POINTS)
+    try:
+        feature, used = fit_settled(partial(least_squares, kind), parallel, feature)
+    except (InputError, np.linalg.LinAlgError):
+        return feature, inliers
+    return feature, parallel[used]
+
+
+def _describe_fit(
+    feature: Feature,
+    basis: Floats,
+    every: Floats,
+    count: int,
+    membership: Membership | None,
+    errors: PointErrors,
+) -> FeatureFit:
+    """The fit of a feature to the points ``basis`` (m, 3), with its uncertainty. ``every`` (n, 3):
+    points that may belong to it, the first ``count`` of which lie in its region."""
+    kind, belongs = feature.kind, np.ones(len(every), bool)
+    if membership is not None:
+        belongs = membership.belongs
+    excluded = count - int(np.count_nonzero(belongs[:count]))
+    if excluded > MAX_EXCLUDED_SHARE * count:
         raise InputError(
-            f"{100 * excluded_share:.0f} % of the region lies off the best {kind}: "
+            f"{100 * excluded / count:.0f} % of the region lies off the best {kind}: "
             "select a region that shows nothing else."
         )
-    basis = sampled[inliers]
     _refuse_other(kind, feature, basis)
     spread, warnings = _estimate_spread(feature, basis, errors), list[str]()
     if found := _find_misfit(feature, basis, errors):
         warnings.append(found[0])
         spread = replace(spread, scatter=spread.scatter + found[1])
+    residuals = feature.distance(every)
+    reason, deviating = "", 0
+    if membership is not None:
+        deviating = int(np.count_nonzero(membership.deviates))
+        reason = replace(
+            membership,
+            isolated=membership.isolated[:count],
+            beside=membership.beside[:count],
+        ).describe_excluded()
+    if deviating:
+        # least squares of these points too would take this step
+        step = np.linalg.lstsq(feature.jacobian(every[belongs]), -residuals[belongs], rcond=None)[0]
+        spread = replace(spread, scatter=spread.scatter + np.outer(step, step))
+        farthest = float(np.abs(residuals[membership.deviates]).max())  # type: ignore[union-attr]
+        warnings.append(
+            f"{100 * deviating / len(every):.2g} % of the points lie off the {kind}, over its own"
+            f" area, by up to {farthest:.3g} mm: they count as its form, and U allows for them"
+        )
     sigma = spread.sigmas[-1]
     if feature.radius is not None and not sigma <= MAX_RADIUS_SIGMA * feature.radius:
         raise InputError(
             f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the"
-            " region shows too little of its curve; select more of it."
+            " region shows too little of its curve; scan more of it."
         )
-    if excluded_share > MAX_EXCLUDED:
+    if excluded > MAX_EXCLUDED * count:
         warnings.append(
-            f"{100 * excluded_share:.1f} % of the region lie beyond {MAX_SIGMA:g} robust sigma "
-            f"of the {kind} and were excluded: see that it shows nothing else"
+            f"{100 * excluded / count:.1f} % of the region's points were excluded ({reason}): see"
+            " that it shows nothing else"
         )
-    fitted = residuals[counted]
+    fitted = residuals[belongs]
     farthest, form = float(fitted[np.argmax(np.abs(fitted))]), narrowest_range(fitted, 0.95)
     return FeatureFit(
-        feature, spread, rms(fitted), farthest, form, used, len(points) - used, tuple(warnings)
+        feature,
+        spread,
+        rms(fitted),
+        farthest,
+        form,
+        every[belongs],
+        excluded,
+        reason,
+        tuple(warnings),
     )
 
 

@@ -14,19 +14,22 @@ never narrower than the minimum zones of ISO 1101.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Literal
 
 import numpy as np
 from scipy.ndimage import uniform_filter
+from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, Uncertainty
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import PATCHES, finite_rows, subsample, sum_by_cube, unit_vectors
-from slviewer.inspection.features import Feature, perpendicular_axes
+from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
+from slviewer.inspection.membership import find_isolated
 from slviewer.inspection.uncertainty import (
     DRAWS,
     Shared,
@@ -45,9 +48,11 @@ SPIKE_SIGMA = 5.0
 CELL_POINTS, MAX_CELLS, WINDOW = 5, 24, 5
 """Of the estimate of the points' density: points a cell at least, cells along a region, and cells
 that are averaged."""
-PATCH_SIGMA = 4.5
-"""Of the mean of a patch: one that is farther off the smooth part shows form that is too fine for
-it."""
+FINE_POINTS, FINE_SIGMA = (6, 24), 5.0
+"""Neighbours whose mean deviation is tested for form that is too fine for the smooth part, and
+standard deviations of that mean from which on it is form."""
+FINE_SHARE = 0.25
+"""Standard uncertainty of a fine defect, as a share of it: it seldom fills its neighbourhood."""
 SPAN_RATIO = 1e-4
 """Directions of a basis with a smaller root mean square tell nothing: a short arc looks the same
 along them."""
@@ -58,9 +63,8 @@ BURN_IN, THINNING = 50, 3
 kept."""
 THIN = 0.01
 POINTS_PER_TERM = 10
-SECTION_SHARE = 0.1
-"""Thickness of the section whose roundness is measured, as a share of the region's length along the
-axis, or of a sphere's diameter."""
+SECTIONS = 10
+"""Along a cylinder, of each of which the roundness is measured."""
 MAX_TILT_DEG = 10.0
 """Features farther from parallel or perpendicular than this are not meant to be so."""
 
@@ -71,8 +75,8 @@ class SmoothDeviations:
 
     ``basis @ draws``, (n, r) and (r, DRAWS), are draws of the smooth part; ``is_noise``: whether
     noise alone explains it. ``noise_mm`` is the standard deviation of one point, and of each
-    weight, ``unresolved_mm`` how far patches lie off the smooth part beyond noise; ``answer`` (r,
-    m) gives the weights by displacements of the ``sampled`` points (m,) along their normals.
+    weight; ``fine`` (n,) mm is what neighbourhoods lie off the smooth part beyond noise; ``answer``
+    (r, m) gives the weights by displacements of the ``sampled`` points (m,) along their normals.
     """
 
     points: Floats
@@ -81,14 +85,22 @@ class SmoothDeviations:
     draws: Floats
     is_noise: bool
     noise_mm: float
-    unresolved_mm: float
+    fine: Floats
     answer: np.ndarray
     sampled: np.ndarray
 
     @property
     def smooth(self) -> Floats:
-        """(n,) mm: the smooth part, the mean of its draws."""
-        return self.basis @ self.draws.mean(axis=1)
+        """(n,) mm: the smooth part, the mean of its draws, and what is too fine for it."""
+        return self.basis @ self.draws.mean(axis=1) + self.fine
+
+
+def smallest_defect(points: Floats, deviations: Floats) -> float:
+    """The smallest local defect, mm, of so few points that it would be found among deviations (n,)
+    mm at points (n, 3): by their noise, which is that of neighbours' differences."""
+    _, near = cKDTree(points).query(points, k=2)
+    noise = robust_sigma(deviations - deviations[near[:, 1]], about=0.0) / np.sqrt(2)
+    return float(FINE_SIGMA * noise / np.sqrt(FINE_POINTS[0]))
 
 
 def smooth_deviations(
@@ -119,12 +131,13 @@ def smooth_deviations(
                 f"The region holds {n} measured points: its form needs"
                 f" {POINTS_PER_TERM * columns}; select a wider region."
             )
-        is_near = np.abs(residuals) <= max(SPIKE_SIGMA * robust_sigma(residuals), rounding)
-        if is_near.all() or not exclusions_left:
+        reach = max(SPIKE_SIGMA * robust_sigma(residuals), rounding)
+        isolated = find_isolated(points, residuals, reach)
+        if not isolated.any() or not exclusions_left:
             break
-        chosen = [each[is_near] for each in chosen]
+        chosen = [each[~isolated] for each in chosen]
     noise = float(np.sqrt(residuals @ residuals / (n - columns)))
-    factor, unresolved = _patch_misfit(residuals, coordinates, noise, columns)
+    factor = _patch_misfit(residuals, coordinates, noise, columns)
     sampled = np.arange(0, n, -(-n // MAX_SHARED_POINTS))
     answer = np.linalg.pinv(whole[sampled], rcond=1e-6)
     # the reference is that of even weight by area, whatever the density of the points
@@ -135,14 +148,16 @@ def smooth_deviations(
     form = weights[removed.shape[1] :]
     draws = np.repeat(weights[:, None], DRAWS, axis=1)
     draws[removed.shape[1] :] = _draw_weights(form, degrees, noise, np.random.default_rng(0))
-    is_noise = bool(form @ form <= noise**2 * chdtri(max(len(form), 1), 1 - LEVEL))
-    return SmoothDeviations(
-        points, normals, smooth, draws, is_noise, noise, unresolved, answer, sampled
+    # what shrinking takes for noise is form where neighbours agree on it
+    fine = _find_fine(points, d - whole @ draws.mean(axis=1), robust_sigma(residuals))
+    is_noise = not fine.any() and bool(
+        form @ form <= noise**2 * chdtri(max(len(form), 1), 1 - LEVEL)
     )
+    return SmoothDeviations(points, normals, smooth, draws, is_noise, noise, fine, answer, sampled)
 
 
-def _range(deviations: Floats) -> Floats:
-    """Return the range of deviations (n, draws) in each draw."""
+def _range(deviations: Floats, points: Floats) -> Floats:
+    """Return the range of deviations (n, draws) in each draw; the ``points`` do not matter."""
     return np.ptp(deviations, axis=0)
 
 
@@ -151,22 +166,26 @@ def zone_width(
     smooth: SmoothDeviations,
     shared: Shared | None,
     displaced: Callable[[Floats, Floats], Floats] | None = None,
-    width: Callable[[Floats], Floats] = _range,
+    width: Callable[[Floats, Floats], Floats] = _range,
+    is_worst: bool = False,
 ) -> Quantity:
     """The width (mm) of a zone that holds the smooth part, with the spread of its draws in U.
 
-    ``width``: of deviations (n, draws), for each draw; ``displaced``: draws of further deviations
-    (n, draws) at points (n, 3) with normals (n, 3), as a datum's or an alignment's errors cause.
+    ``width``: of deviations (n, draws) at points (n, 3), for each draw; ``displaced``: draws of
+    further deviations (n, draws) at points (n, 3) with normals (n, 3), as a datum's or an
+    alignment's errors cause. ``is_worst``: the width is that of the worst of several zones, whose
+    noise it picks out: as much as the draws add is subtracted.
     """
     field = smooth.smooth
     chosen = np.unique(
         [*range(0, len(field), -(-len(field) // MAX_DRAWN_POINTS)), field.argmin(), field.argmax()]
     )
-    drawn = smooth.basis[chosen] @ smooth.draws
+    drawn = smooth.basis[chosen] @ smooth.draws + smooth.fine[chosen, None]
     if displaced is not None:
         drawn = drawn + displaced(smooth.points[chosen], smooth.normals[chosen])
-    widths, value = width(drawn), float(width(field[:, None])[0])
-    variance = float(widths.var()) + smooth.unresolved_mm**2
+    widths = width(drawn, smooth.points[chosen])
+    value = float(width(field[:, None], smooth.points)[0])
+    variance = float(widths.var()) + (FINE_SHARE * float(np.abs(smooth.fine).max())) ** 2
     if shared is not None:
         # where the zone touches, its width answers to the deviations there; the rest of the field
         # leaves it unchanged
@@ -176,14 +195,17 @@ def zone_width(
         signs = np.sign(field[ends] - np.median(field))
         moved = np.repeat(field[:, None], 2, axis=1)
         moved[ends, [0, 1]] += signs * change
-        by_field[ends] = (width(moved) - value) / change * signs
+        by_field[ends] = (width(moved, smooth.points) - value) / change * signs
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
         effects = shared(smooth.points[places], answers[None, :, None] * smooth.normals[places])
         variance += float(np.sum(effects**2))
     # what the draws' scatter adds to the width bounds by how much the mean's own scatter may have
     # widened it
-    sigma = float(np.sqrt(variance + (widths.mean() - value) ** 2 / 3))
+    added = float(widths.mean()) - value
+    sigma = float(np.sqrt(variance + added**2 / 3))
+    if is_worst:
+        value -= min(max(added, 0.0), value)
     return Quantity(
         name, value, "mm", max(sigma, value / 2) if smooth.is_noise else sigma, shared is not None
     )
@@ -192,40 +214,43 @@ def zone_width(
 def form_error(
     kind: FormKind, fit: FeatureFit, points: Floats, shared: Shared | None = None
 ) -> Quantity:
-    """Flatness of a plane, cylindricity of a cylinder, roundness of a section of a cylinder or a
-    sphere, mm.
+    """Flatness of a plane, cylindricity of a cylinder, roundness of a cylinder or a sphere, mm.
 
-    ``points`` (n, 3) mm: of the region. A cylinder's section is perpendicular to its axis, in the
-    middle; a sphere's goes through its centre and the middle of what was measured. Raises
-    InputError for another feature or for too few points.
+    ``points`` (n, 3) mm: of the feature. Roundness is that of the worst section of a cylinder; of a
+    sphere the width of the zone that holds all of it: no section is wider. Raises InputError for
+    another feature or for too few points.
     """
     f = fit.feature
     wanted = {"flatness": "plane", "cylindricity": "cylinder", "roundness": "sphere or cylinder"}
     if f.kind not in wanted[kind].split(" or "):
         raise InputError(f"A {f.kind} has no {kind}: choose a {wanted[kind]}.")
     points = points[finite_rows(points)]
-    if kind == "roundness":
-        points, axis = _section_points(f, points)
-        normals = f.normals(points)
-        across = normals - (normals @ axis)[:, None] * axis
-        coordinates = unit_vectors(across)
-        # a circle: a thin section shows no tilt
-        fitted = np.column_stack([coordinates, np.ones(len(points))])
-        first = coordinates[0]
-        unrolled = np.arctan2(coordinates @ np.cross(axis, first), coordinates @ first)[:, None]
+    normals, fitted = f.normals(points), f.jacobian(points)
+    if f.kind == "plane":
+        coordinates = unrolled = _region_coordinates(points)
+    elif f.kind == "sphere":
+        coordinates = unrolled = normals
     else:
-        normals = f.normals(points)
-        coordinates = (
-            _region_coordinates(points) if f.kind == "plane" else _cylinder_coordinates(f, points)
-        )
-        fitted = f.jacobian(points)
-        unrolled = coordinates
-        if f.kind == "cylinder":
-            unrolled = np.column_stack(
-                [np.arctan2(coordinates[:, 1], coordinates[:, 0]), coordinates[:, 2]]
-            )
+        coordinates = _cylinder_coordinates(f, points)
+        around, along = coordinates[:, :2], coordinates[:, 2:]
+        unrolled = np.column_stack([np.arctan2(around[:, 1], around[:, 0]), along])
     smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted, unrolled)
+    if kind == "roundness" and f.kind == "cylinder":
+        return zone_width(kind, smooth, shared, width=partial(_section_range, f), is_worst=True)
     return zone_width(kind, smooth, shared)
+
+
+def _section_range(f: Feature, deviations: Floats, points: Floats) -> Floats:
+    """Return the largest range of deviations (n, draws) at points (n, 3) from the circle of a
+    section of a cylinder, of `SECTIONS` along it, in each draw."""
+    coordinates = _cylinder_coordinates(f, points)
+    section = np.minimum((coordinates[:, 2] + 1) / 2 * SECTIONS, SECTIONS - 1).astype(int)
+    circle = np.column_stack([coordinates[:, :2], np.ones(len(points))])
+    ranges = [np.zeros(deviations.shape[1])]
+    for k in np.unique(section):
+        own, columns = deviations[section == k], circle[section == k]
+        ranges.append(_range(own - columns @ np.linalg.lstsq(columns, own, rcond=None)[0], points))
+    return np.asarray(np.max(ranges, axis=0))
 
 
 def orientation_error(
@@ -284,10 +309,15 @@ def orientation_error(
 
 
 def position_error(
-    fit: FeatureFit, points: Floats, nominal: Feature, alignment: Uncertainty | None = None
+    fit: FeatureFit,
+    points: Floats,
+    nominal: Feature,
+    alignment: Uncertainty | None = None,
+    shared: Shared | None = None,
 ) -> Quantity:
     """Position, mm: the diameter of the zone about the ``nominal`` place that holds a sphere's
-    centre or a cylinder's axis over its region, or the width of the zone that holds a plane.
+    centre or a cylinder's axis over its region, or the width of the zone that holds a flat surface,
+    with its form.
 
     ``points`` (n, 3) mm of the region, like the ``nominal`` in part coordinates, as ``fit``.
     """
@@ -297,13 +327,15 @@ def position_error(
         )
     points = points[finite_rows(points)]
     f = fit.feature
-    if f.direction is None:
-        reached = np.zeros((1, 3))
-    elif f.kind == "cylinder":
+    if f.kind == "plane":
+        zone = profile_error(
+            points, nominal.distance(points), nominal.normals(points), alignment, shared
+        )
+        return replace(zone, name="position")
+    reached = np.zeros((1, 3))
+    if f.direction is not None:
         along = (points - f.place) @ f.direction
         reached = np.array([along.min(), along.max()])[:, None] * f.direction
-    else:
-        reached = subsample(points, 200) - f.place
     rng = np.random.default_rng(2)
     shifts = np.zeros((DRAWS, len(reached), 3))
     if alignment is not None:
@@ -318,8 +350,6 @@ def position_error(
         if f.kind == "cylinder":
             turned = feature.unit_direction - f.unit_direction
             places = places + (reached @ f.unit_direction)[:, None] * turned
-        elif f.kind == "plane":  # the plane's points under the measured ones
-            places = places - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
         return 2 * float(np.abs(place_or_axis.distance(places)).max())
 
     drawn = np.array([off(f.moved(step), shift) for step, shift in zip(steps, shifts, strict=True)])
@@ -357,8 +387,9 @@ def profile_error(
     return zone_width("profile", smooth, shared, displaced, _twice_largest)
 
 
-def _twice_largest(deviations: Floats) -> Floats:
-    """Return twice the largest size of deviations (n, draws) in each draw."""
+def _twice_largest(deviations: Floats, points: Floats) -> Floats:
+    """Return twice the largest size of deviations (n, draws) in each draw; the ``points`` do not
+    matter."""
     return 2 * np.abs(deviations).max(axis=0)
 
 
@@ -478,11 +509,23 @@ def _even_weights(unrolled: Floats) -> Floats:
     return occupied[place] / sums[place]
 
 
-def _patch_misfit(
-    residuals: Floats, coordinates: Floats, noise: float, columns: int
-) -> tuple[float, float]:
-    """How many times larger than independent ones the patches' mean residuals are (at least 1), and
-    by how much (mm) some lie off what noise explains."""
+def _find_fine(points: Floats, residuals: Floats, sigma: float) -> Floats:
+    """Mean residuals (n,) mm of each point's neighbours where noise does not explain them, else 0:
+    the largest of those of `FINE_POINTS` neighbours. ``sigma``: the noise, mm."""
+    fine = np.zeros(len(points))
+    if not sigma > 1e-9 * float(np.abs(points).max()):
+        return fine
+    _, near = cKDTree(points).query(points, k=min(max(FINE_POINTS), len(points)))
+    sums = np.cumsum(residuals[near], axis=1)
+    for count in FINE_POINTS:
+        means = sums[:, count - 1] / count
+        is_larger = np.abs(means) > np.maximum(FINE_SIGMA * sigma / np.sqrt(count), np.abs(fine))
+        fine[is_larger] = means[is_larger]
+    return fine
+
+
+def _patch_misfit(residuals: Floats, coordinates: Floats, noise: float, columns: int) -> float:
+    """How many times larger than independent ones the patches' mean residuals are, at least 1."""
     low = coordinates.min(axis=0)
     side = max(float(np.ptp(coordinates, axis=0).max()) / PATCHES, 1e-12)
     padding = (0, 0), (0, 3 - coordinates.shape[1])
@@ -491,15 +534,11 @@ def _patch_misfit(
     means, expected = sums / counts, noise / np.sqrt(counts)
     large = counts >= POINTS_PER_TERM
     if not large.any() or not noise > 0:
-        return 1.0, 0.0
+        return 1.0
     # the smooth part takes its share of the patches' freedom
     freedom = max(1 - columns / int(large.sum()), 0.25)
-    means, expected = np.abs(means[large]), expected[large]
-    factor = float(np.sqrt(max(float(np.mean((means / expected) ** 2)) / freedom, 1.0)))
-    beyond = means - PATCH_SIGMA * expected
-    worst = int(np.argmax(beyond))
-    # a defect seldom fills its patch
-    return factor, 2 * float(means[worst]) if beyond[worst] > 0 else 0.0
+    squares = (means[large] / expected[large]) ** 2
+    return float(np.sqrt(max(float(np.mean(squares)) / freedom, 1.0)))
 
 
 def _region_coordinates(points: Floats, axes: int = 2) -> Floats:
@@ -523,15 +562,3 @@ def _cylinder_coordinates(f: Feature, points: Floats) -> Floats:
     return np.column_stack(
         [normals @ first, normals @ np.cross(axis, first), (along - middle) / half]
     )
-
-
-def _section_points(f: Feature, points: Floats) -> tuple[Floats, Floats]:
-    """The points of the section whose roundness is measured, and its normal (3,)."""
-    if f.kind == "cylinder":
-        axis = f.unit_direction
-        along = (points - f.place) @ axis
-        middle, reach = (along.max() + along.min()) / 2, SECTION_SHARE * float(np.ptp(along)) / 2
-        return points[np.abs(along - middle) <= reach], axis
-    towards = points.mean(axis=0) - f.place
-    axis = perpendicular_axes(towards)[0]
-    return points[np.abs((points - f.place) @ axis) <= SECTION_SHARE * (f.radius or 0.0)], axis

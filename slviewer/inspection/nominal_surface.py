@@ -309,8 +309,8 @@ def search_pose(
     face either way.
 
     A scan that ``has_camera`` shows one side of a part: poses are searched on what a camera sees of
-    the nominal from each of the ``views`` (on all of it first without), and fitted to all of it, until
-    one fits well; else the one of least cost is taken. Among the poses of a symmetric part the
+    the nominal from each of the ``views`` (on all of it first without), and fitted to all of it,
+    until one fits well; else the one of least cost is taken. Among the poses of a symmetric part the
     choice does not change the deviations. Raises ``Refused`` where the best does not fit, or the
     shape does not hold it.
     """
@@ -357,8 +357,8 @@ def search_pose(
 def _list_sides(
     surface: NominalSurface, has_camera: bool, views: Sequence[Floats], report: Progress
 ) -> Iterator[tuple[PreparedScan, Floats]]:
-    """Yield what a camera sees of the nominal from each of the ``views``, and its centre (3,) mm; first
-    all of it, from the origin, for a scan without camera."""
+    """Yield what a camera sees of the nominal from each of the ``views``, and its centre (3,) mm;
+    first all of it, from the origin, for a scan without camera."""
     places, facing = surface.sample(SAMPLES)
     if not has_camera:
         yield prepare_scan("nominal model", places, facing, has_camera=False), np.zeros(3)

@@ -70,6 +70,11 @@ class Region:
         centre = (T[:3, :3] @ self.centre + T[:3, 3]).round(6)
         return Region(self.kind, centre, self.size, axes.round(9) if is_turned else None)
 
+    @property
+    def widened(self) -> "Region":
+        """The region with its least half side, or its radius, added all around."""
+        return Region(self.kind, self.centre, self.size + self.size.min(), self.axes)
+
     def within(self, points: np.ndarray) -> np.ndarray:
         """Bool like points (h, w, 3) or (n, 3) without their last axis; False for NaN."""
         finite = finite_rows(points)

@@ -66,8 +66,7 @@ def explain_misfit(
     if T is not None:
         scale, sigma = _fit_scale(points, normals, surface, T, near_mm)
         scaled = NominalSurface(_scale(nominal, scale, surface.middle))
-        moved = turn_about(np.zeros(3), surface.middle) @ T
-        share = _share_off(points, normals, scaled, _refit(points, normals, scaled, moved), near_mm)
+        share = _share_off(points, normals, scaled, _refit(points, normals, scaled, T), near_mm)
         if abs(scale - 1) > SCALE_SIGMAS * sigma and share < most:
             change = "larger" if scale > 1 else "smaller"
             return (
@@ -94,7 +93,7 @@ def _ignore(share: float) -> None:
 
 def _list_others(nominal: Mesh, points: Floats, size: float) -> Iterator[tuple[str, Mesh, float]]:
     """Yield the models that a scan may show instead: what each is in words, and its scale."""
-    mirrored = nominal.vertices * np.float32([-1, 1, 1])
+    mirrored = nominal.vertices * np.array([-1, 1, 1], np.float32)
     ratio = diagonal(np.percentile(points, [1, 99], axis=0)) / size
     if 1 / MATCHING < ratio < MATCHING:
         yield "the mirror image of the model", Mesh(mirrored, nominal.faces[:, ::-1]), 1.0
@@ -155,7 +154,8 @@ def _fit(
         if with_scale:
             scale *= 1 + step[6] / size
             sigma = noise * float(np.sqrt(np.linalg.inv(normal)[6, 6])) / size
-        T = turn_about(step[:3] / size, surface.middle, scale * step[3:6]) @ T
+        motion = np.asarray(step, np.float64)
+        T = turn_about(motion[:3] / size, surface.middle, scale * motion[3:6]) @ T
         reach = max(4.685 * noise, 0.2 * reach)
     return T, scale, sigma
 

@@ -5,7 +5,7 @@ a plan from the measurements of a session, to repeat them on other scans."""
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -13,21 +13,12 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from slviewer.errors import InputError, SlviewerError, UsageError
-from slviewer.geometry.rigid import Uncertainty, move_points
-from slviewer.inspection.deviation import NominalArea
-from slviewer.inspection.features import Feature, relation
+from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import (
-    FeatureFit,
     datum_frame,
-    datum_spread,
-    face_towards,
-    fit_feature,
 )
-from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
-from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
-from slviewer.inspection.tolerance import judge_limits
-from slviewer.inspection.uncertainty import PointErrors
+from slviewer.pipeline.aligned_part import AlignedPart, judge_characteristic
 from slviewer.pipeline.compare import fit_to_nominal
 from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
@@ -49,6 +40,7 @@ from slviewer.pipeline.operation import (
     part,
 )
 from slviewer.printable import format_csv
+from slviewer.records.acceptance import Decision
 from slviewer.records.inspection import (
     Capability,
     Characteristic,
@@ -56,15 +48,13 @@ from slviewer.records.inspection import (
     Inspection,
     PartResult,
 )
-from slviewer.records.measurement import Measurement, Quantity
+from slviewer.records.measurement import Measurement
 from slviewer.records.record import from_plain, to_plain
+from slviewer.registration.refusal import WrongPart
 from slviewer.report.session import write_parts_page
 from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.inspection_plan import (
-    FORMS,
     KINDS,
-    SIZES,
-    TO_DATUM,
     Alignment,
     Plan,
     PlanFeature,
@@ -72,7 +62,7 @@ from slviewer.session.inspection_plan import (
     write_plan,
 )
 from slviewer.session.layout import is_session
-from slviewer.session.nominal import NOMINALS, Nominal, read_nominal
+from slviewer.session.nominal import NOMINALS, read_nominal
 from slviewer.session.store import Session
 
 Load = Callable[[Progress], MeasuredSurface]
@@ -85,8 +75,6 @@ _DECIMALS = 4
 FORM_OF = {"plane": "flatness", "sphere": "roundness", "cylinder": "cylindricity"}
 CONFIDENCE, MIN_PARTS = 0.95, 3
 """Of a capability: of its intervals, and the parts that it takes."""
-DATUM_ROUNDS = 4
-"""Fits of the datums, each with the regions moved by the frame of the last."""
 
 
 @dataclass(frozen=True)
@@ -185,13 +173,21 @@ def inspect_surfaces(
                 scales[surface.model] = surface.scale
             try:
                 aligned = AlignedPart(plan, surface, nominal)
+            except WrongPart:
+                raise
             except SlviewerError as error:
                 raise InputError(f"not aligned: {error}") from error
-            results = tuple(_measure(each, aligned, plan.min_area) for each in plan.characteristic)
+            results = tuple(
+                judge_characteristic(each, aligned, plan.min_area) for each in plan.characteristic
+            )
         except SlviewerError as error:
             if error.exit_status == 130:  # cancelled
                 raise
-            results = tuple(_undecided(each, str(error)) for each in plan.characteristic)
+            decision: Decision = "fail" if isinstance(error, WrongPart) else "undecided"
+            results = tuple(
+                CharacteristicResult(each.name, None, None, decision, str(error))
+                for each in plan.characteristic
+            )
         parts.append(PartResult(name, results))
     progress(1.0, "inspected")
     return Inspection(
@@ -280,11 +276,6 @@ def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]
         yield Found(next_name(store, Inspection), found, files=files, notes=notes)
 
 
-def _undecided(wanted: Characteristic, reason: str) -> CharacteristicResult:
-    """The result of a characteristic that could not be measured."""
-    return CharacteristicResult(wanted.name, None, None, "undecided", reason)
-
-
 def process_capability(
     values: Sequence[float], lower: float | None, upper: float | None
 ) -> Capability | None:
@@ -309,149 +300,6 @@ def process_capability(
     cpk = min(mean - low, high - mean) / (3 * sigma)
     reach = float(-ndtri(tail) * np.sqrt(1 / (9 * n) + cpk**2 / (2 * (n - 1))))
     return Capability(n, mean, sigma, cp, (cpk, cpk - reach, cpk + reach))
-
-
-class AlignedPart:
-    """A scan's points in part coordinates, ``T_part_scan``; ``feature`` of a name fits that to
-    them, once.
-
-    ``spread``: what the alignment adds to the uncertainty of places; None without one. Raises
-    InputError where the part cannot be aligned.
-    """
-
-    def __init__(self, plan: Plan, surface: MeasuredSurface, nominal: Nominal | None) -> None:
-        self.features = {each.name: each for each in plan.feature}
-        self._surface = surface
-        self._scan_points = surface.points[surface.measured].astype(np.float64)
-        self._nominal_surface: NominalSurface | None = None
-        self._area: NominalArea | None = None
-        self._reach = np.inf
-        self.T_part_scan: np.ndarray = np.eye(4)
-        self.spread: Uncertainty | None = None
-        if not len(self._scan_points):
-            raise InputError(f"{surface.source} has no measured points: scan the part again.")
-        if nominal is not None:
-            result = fit_to_nominal(surface, nominal)
-            self._nominal_surface, self._area = result.surface, result.area
-            self.T_part_scan, self.spread = result.T_nominal_scan, result.alignment_spread
-            self._reach = result.reach_mm
-        if plan.alignment.kind == "3-2-1":
-            self.T_part_scan = np.array(plan.alignment.start)
-            self._align_datums(plan.alignment.datums)
-        self.points = move_points(self.T_part_scan, self._scan_points)
-        self.feature: Callable[[str], FeatureFit] = cache(self._fit)
-
-    def profile(self, name: str) -> Quantity:
-        """The profile of a region against the nominal model. Raises InputError without one."""
-        if self._nominal_surface is None:
-            raise InputError(
-                "A profile needs the nominal model: give its file as `nominal` of the plan's"
-                " alignment."
-            )
-        within = self.features[name].region.within(self.points)
-        away, towards = self._nominal_surface.signed(self.points[within])
-        away[np.abs(away) > self._reach] = np.nan
-        return profile_error(self.points[within], away, towards, self.spread, self.errors.raised)
-
-    def doubts(self, names: Sequence[str]) -> list[str]:
-        """Return the warnings about the scan and the fits of features."""
-        fitted = [name for name in names if self.features[name].kind != "surface"]
-        found = [warning for name in fitted for warning in self.feature(name).warnings]
-        return [*self.errors.warnings, *dict.fromkeys(found)]
-
-    def percent_measured(self, name: str) -> float | None:
-        """Percent of a feature's area that the scan's views can see and was measured; None where
-        that is not known."""
-        if self._area is None:
-            return None
-        return self._area.percent_measured(self.features[name].region.within(self._area.places))
-
-    @property
-    def errors(self) -> PointErrors:
-        """Errors of the points in part coordinates."""
-        return self._surface.errors.moved(self.T_part_scan)
-
-    def _align_datums(self, datums: Sequence[str]) -> None:
-        """Align by three datums, whose regions follow the part."""
-        first = self.T_part_scan
-        for _ in range(DATUM_ROUNDS):
-            fits = [self._fit(name, as_planned=True) for name in datums]
-            self.T_part_scan = datum_frame([fit.feature for fit in fits]) @ self.T_part_scan
-        if np.trace(self.T_part_scan[:3, :3] @ first[:3, :3].T) < 1.0:
-            raise InputError(
-                "The datums turn the part by more than 90 degrees: place it as the plan's own part"
-                " lay."
-            )
-        middle = move_points(self.T_part_scan, self._scan_points).mean(axis=0)
-        self.spread = datum_spread(fits, middle)
-
-    def _fit(self, name: str, as_planned: bool = False) -> FeatureFit:
-        """Fit a feature to the part as it lies now; a plane faces the camera, or the side that it
-        has ``as_planned``. Raises InputError where the part has none."""
-        feature, T = self.features[name], self.T_part_scan
-        if feature.kind == "surface":
-            raise InputError(
-                f"{name} is a surface, which has a profile alone: choose a fitted feature."
-            )
-        points = move_points(T, self._scan_points)
-        within = feature.region.within(points)
-        try:
-            fit = fit_feature(feature.kind, points[within], self.errors)
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
-        towards = T[:3, 3] - fit.feature.place
-        if as_planned and feature.direction is not None:
-            towards = np.array(feature.direction)
-        return face_towards(fit, towards)
-
-
-def _measure(wanted: Characteristic, part: AlignedPart, min_area: float) -> CharacteristicResult:
-    """Measure and judge one characteristic; where that is impossible, or too little was measured,
-    the result holds the reason."""
-    try:
-        quantity = measure_characteristic(wanted, part)
-    except (SlviewerError, np.linalg.LinAlgError) as error:
-        return _undecided(wanted, str(error))
-    value, U = quantity.value, quantity.U
-    if U is None or not np.isfinite(value + U):
-        return _undecided(wanted, "its uncertainty is not known")
-    decision = judge_limits(value, U, wanted.lower, wanted.upper)
-    doubts = part.doubts(wanted.features)
-    for name in wanted.features:
-        percent = part.percent_measured(name)
-        if percent is not None and percent < min_area:
-            decision = "undecided"
-            doubts.append(
-                f"{percent:.1f} % of the area of {name} that the views can see was measured, and"
-                f" {min_area:g} % are needed: scan what is missing and merge, or give a smaller"
-                " min_area in the plan"
-            )
-    whole = quantity.whole and bool(part.errors.calibration)
-    return CharacteristicResult(wanted.name, value, U, decision, "; ".join(doubts), whole)
-
-
-def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantity:
-    """Measure a characteristic. Raises InputError where the part does not show it."""
-    kind, (name, *others) = wanted.kind, wanted.features
-    if kind == "profile":
-        return part.profile(name)
-    fit, planned = part.feature(name), part.features[name]
-    points = part.points[planned.region.within(part.points)]
-    if kind in FORMS:
-        return form_error(kind, fit, points, part.errors.raised)  # type: ignore[arg-type]
-    if kind == "position":
-        return position_error(fit, points, planned.nominal(), part.spread)
-    if kind in SIZES:
-        quantities = fit.quantities()
-    else:
-        datum = part.feature(others[0])
-        if kind in TO_DATUM:
-            return orientation_error(kind, fit, points, datum, part.errors.raised)  # type: ignore[arg-type]
-        quantities = relation(fit.feature, fit.spread, datum.feature, datum.spread)
-    named = {quantity.name: quantity for quantity in quantities}
-    if kind in named:
-        return named[kind]
-    raise InputError(f"A {fit.feature.kind} has no {kind} here: it has {', '.join(named)}.")
 
 
 def plan(

@@ -388,7 +388,7 @@ def _fit(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     fields |= {
         "quantities": fit.quantities(),
         "region": from_plain(to_plain(region), MeasuredRegion),
-        "where": f"{region.text()}: {fit.used:,} used, {fit.left_out:,} excluded",
+        "where": f"{region.text()}: {fit.used:,} used, {fit.excluded:,} excluded",
         "warnings": tuple(warnings),
     }
     return fields, arrays

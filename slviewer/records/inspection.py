@@ -46,7 +46,11 @@ class Characteristic:
 class CharacteristicResult(msgspec.Struct, frozen=True):
     """A characteristic of one part: its ``value`` and ``U`` (k = 2), and the ``decision``; or the
     ``reason`` why it could not be measured, or why it is doubtful. ``whole``: whether U holds the
-    calibration's part."""
+    calibration's part.
+
+    The evidence: percent of the feature's area that was ``measured``, of what the views can see;
+    percent of the points in its region that are ``excluded``, and as what; and the ``smallest``
+    local defect, mm, that noise and spacing would have shown. Each None where it is not known."""
 
     name: str
     value: float | None
@@ -54,6 +58,22 @@ class CharacteristicResult(msgspec.Struct, frozen=True):
     decision: Decision
     reason: str = ""
     whole: bool = True
+    measured: float | None = None
+    excluded: float | None = None
+    excluded_as: str = ""
+    smallest: float | None = None
+
+    @property
+    def evidence(self) -> str:
+        """The evidence in words; empty where none is known."""
+        listed = []
+        if self.measured is not None:
+            listed.append(f"{self.measured:.0f} % of the area measured")
+        if self.excluded:
+            listed.append(f"{self.excluded:.1f} % of the points excluded: {self.excluded_as}")
+        if self.smallest is not None:
+            listed.append(f"defects from {self.smallest:.2g} mm would show")
+        return "; ".join(listed)
 
 
 class PartResult(msgspec.Struct, frozen=True):
@@ -149,6 +169,10 @@ class Inspection(Record, frozen=True, kw_only=True):
                 Column("lower", digits=4, detail=True): wanted.lower,
                 Column("upper", digits=4, detail=True): wanted.upper,
                 "decision": Cell(result.decision, MARKS[result.decision]),
+                Column("measured", "%", digits=0): result.measured,
+                Column("excluded", "%", digits=1, detail=True): result.excluded,
+                Column("excluded as", detail=True): result.excluded_as,
+                Column("smallest defect", "mm", digits=4, detail=True): result.smallest,
                 Column("reason", detail=True): result.reason,
             }
             for each in self.parts

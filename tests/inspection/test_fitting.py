@@ -35,7 +35,7 @@ def test_a_sphere_with_strays_has_its_radius_within_its_uncertainty() -> None:
     assert 0.028 < found.rms < 0.032 and 0.11 < found.form < 0.125
     assert found.rms < abs(found.maximum) < 0.2
     assert (
-        0.13 < found.left_out / 6000 < 0.15 and missing_facts(found.warnings[0], "excluded") == []
+        0.13 < found.excluded / 6000 < 0.15 and missing_facts(found.warnings[0], "excluded") == []
     )
     radius, diameter, *_ = found.quantities()
     assert diameter.value == 2 * radius.value and abs(diameter.U / sigma - 4) < 0.05

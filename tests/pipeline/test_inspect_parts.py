@@ -1,6 +1,7 @@
 """A plan on synthesised parts: those out of tolerance are found, and no others."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from slviewer.pipeline.inspect_parts import (
     write_inspection,
 )
 from slviewer.pipeline.measure import MeasuredSurface
-from slviewer.records.inspection import Characteristic, Inspection
+from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
+from slviewer.records.record import from_plain, to_plain
 from slviewer.session.inspection_plan import (
     Alignment,
     Plan,
@@ -203,6 +205,39 @@ def test_what_cannot_be_measured_is_named_and_takes_nothing_with_it(tmp_path: Pa
     assert not missing_facts(good.results[-1].reason, 0, "points")
     assert all(each.reason == "no such scan" for each in bad.results)
     assert all("no such scan" in text for text in write_files(inspection, tmp_path))
+
+
+def test_result_without_evidence_loads_and_one_with_it_tells_it() -> None:
+    old = from_plain(
+        {"name": "a", "value": 1.0, "U": 0.1, "decision": "pass"}, CharacteristicResult
+    )
+    assert old.measured is None and old.evidence == ""
+    new = CharacteristicResult("a", 1.0, 0.1, "pass", "", True, 91.0, 2.5, "isolated", 0.02)
+    assert not missing_facts(new.evidence, 91, 2.5, "isolated", 0.02)
+    assert from_plain(to_plain(new), CharacteristicResult) == new
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize("fault", ["missing", "elsewhere", "hardly measured"])
+def test_feature_that_is_not_shown_is_undecided(fault: str) -> None:
+    """A ball that is missing, that lies elsewhere in its region, and a table of which hardly any
+    points are left."""
+    surface, plan = synthesised_part(1), make_plan(2.0)
+    part = move_points(np.linalg.inv(POSE), surface.points.astype(np.float64))
+    is_ball = np.hypot(*part[:, :2].T) < 15
+    if fault == "missing":
+        kept = ~is_ball
+    elif fault == "elsewhere":
+        kept = ~is_ball | (np.linalg.norm(part - [0, 0, 10], axis=1) < 11)
+        part[is_ball] += [5.0, 0.0, 0.0]
+    else:
+        kept = is_ball | (part[:, 0] < 20) | (part[:, 1] < -20)
+    points = move_points(POSE, part[kept]).astype(np.float32)
+    shown = replace(surface, points=points, sigma_mm=surface.sigma_mm[kept])
+    results = {r.name: r for r in inspect_surfaces(plan, [("p", lambda _: shown)]).parts[0].results}
+    judged = results["flatness" if fault == "hardly measured" else "diameter"]
+    assert judged.decision == "undecided" and judged.reason
+    assert "smaller" not in judged.reason
 
 
 def test_capability_of_known_spread() -> None:
