@@ -100,8 +100,8 @@ def confirm_by_captures(captures: Iterable[Capture], rig: StereoRig) -> tuple[Tr
                 break
         elif len(capture.sequence.axes) == 1 and capture.size == rig.camera.size:
             singles.append(capture)
-    for capture in singles[: 1 if not checks else 0]:
-        phases = match_second(capture, decode_capture(capture, relative=True))
+    for capture in [each for each in singles if each.second is None and not checks][:1]:
+        phases = decode_capture(capture, relative=True)
         if not any(phase.is_relative for phase in phases.values()):
             checks.append(check_single_axis(capture.name, rig, phases))
     if checks and checks[-1].failure:
