@@ -51,6 +51,7 @@ from slviewer.pipeline.models import (
     Model,
     ModelName,
     available_models,
+    device_centres,
     load_model,
     load_pair,
     load_stereo,
@@ -172,13 +173,16 @@ def _measure_positions(
     """Measure the artefact at each position, {capture: position}."""
     positions = list[PositionErrors]()
     depth_range = load_stereo(job.store).depth_range_mm
+    projector = next((centres[1] for centres in device_centres(job.store)), None)
     for shot, frames, cloud in reconstruct_captures(job, chosen, list(captures), "measuring"):
         plate, name = None, shot.name
         if certified.kind == "plane" and shot.role == "calibration":
             plate = segment_board(job.store, shot, capture_texture(shot, frames), job.warn)
         try:
             positions.append(
-                measure_artefact(certified, cloud, captures[name], name, depth_range, plate)
+                measure_artefact(
+                    certified, cloud, captures[name], name, depth_range, plate, projector
+                )
             )
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
