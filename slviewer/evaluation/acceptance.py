@@ -33,12 +33,12 @@ from slviewer.records.acceptance import (
     AcceptanceTest,
     CertifiedArtefact,
     Decision,
-    Evidence,
     JudgedProperty,
     PositionErrors,
     PropertyError,
     ScaleError,
     StillCaptures,
+    SurfaceEvidence,
     worst_decision,
 )
 from slviewer.records.record import from_plain, to_vector
@@ -209,7 +209,7 @@ def narrowest_range(deviations: np.ndarray, share: float) -> float:
 
 
 def make_form_error(
-    name: str, position: str, shown: ShapeResult, evidence: Evidence, U_mm: float
+    name: str, position: str, shown: ShapeResult, evidence: SurfaceEvidence, U_mm: float
 ) -> PropertyError:
     """Return the error of form from points' deviations from their shape: the range of 95 % of
     them, or that which neighbours share, if that is wider."""
@@ -280,7 +280,7 @@ def _measure_balls(
     artefact: Artefact,
     cloud: Cloud,
     balls: list[ShapeResult],
-    evidence: list[Evidence],
+    evidence: list[SurfaceEvidence],
     position: str,
 ) -> tuple[list[PropertyError], float]:
     """The figures of one ball or two, and the noise of a length between their centres (of a

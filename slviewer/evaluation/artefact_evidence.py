@@ -12,7 +12,7 @@ from slviewer.evaluation.fit import Map, Points, ShapeResult
 from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.shapes import Sphere
 from slviewer.geometry.vectors import unit_vectors
-from slviewer.records.acceptance import Evidence
+from slviewer.records.acceptance import SurfaceEvidence
 
 VISIBLE, VISIBLE_ALONE = (np.cos(np.radians(angle)) for angle in (60.0, 45.0))
 """A ball's surface is expected where camera and projector see it no flatter than this, where the
@@ -29,7 +29,7 @@ rises more, such as the bar before a ball, covers it."""
 
 def collect_evidence(
     result: ShapeResult, points: Points, projector: Floats | None, plate: Mask | None = None
-) -> Evidence:
+) -> SurfaceEvidence:
     """Return what the fit of a ball or a plane to a cloud (h, w, 3) mm rests on.
 
     ``projector`` (3,) mm: its centre, where that is known; ``plate`` (h, w) bool: the plane's
@@ -50,7 +50,7 @@ def collect_evidence(
     own = np.isfinite(distance) & (evaluated | inside | _select_lumps(others, distance, width_mm))
     low, high = _shared_deviations(np.where(own, distance, np.nan), total)
     measured = int(np.count_nonzero(own))
-    return Evidence(
+    return SurfaceEvidence(
         measured=min(1.0, measured / max(total, 1)),
         covered=min(1.0, int(np.count_nonzero(others & ~own)) / max(total, 1)),
         excluded=1.0 - int(np.count_nonzero(own & result.inliers)) / max(measured, 1),

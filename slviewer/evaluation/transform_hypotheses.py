@@ -40,7 +40,7 @@ from slviewer.reconstruction.axis_agreement import (
     ray_depths,
     sample_axes,
 )
-from slviewer.records.calibration import Answer, Evidence, TransformCheck
+from slviewer.records.calibration import Answer, Compared, TransformCheck
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0}
 UNIT_TOLERANCE = 0.03
@@ -83,7 +83,7 @@ class Fit:
 Fits = Mapping[Direction, Fit]
 
 
-def check_axes(name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]) -> TransformCheck:
+def check_by_axes(name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]) -> TransformCheck:
     """Check R and T by a capture with both axes: the misfit is the distance from the epipolar
     lines, px. Raises InputError where too few pixels are decoded."""
     pixels, measured, sigma = sample_axes(phases)
@@ -107,7 +107,7 @@ def check_axes(name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]) -> Tr
     return check
 
 
-def check_board(name: str, rig: StereoRig, points: Floats, measured: Floats) -> TransformCheck:
+def check_by_board(name: str, rig: StereoRig, points: Floats, measured: Floats) -> TransformCheck:
     """Check R and T, and the length of T, by a board's features (n, 3) mm in the camera's frame and
     their projector coordinates (n, 2) px, a column of NaN for an axis without patterns. The misfit
     is the distance from the projected features, px."""
@@ -130,7 +130,7 @@ def check_board(name: str, rig: StereoRig, points: Floats, measured: Floats) -> 
     return _make_check(name, "board", fits, float(np.median(points[:, 2])))
 
 
-def check_sphere(name: str, rig: StereoRig, phase: PhaseMap, radius_mm: float) -> TransformCheck:
+def check_by_sphere(name: str, rig: StereoRig, phase: PhaseMap, radius_mm: float) -> TransformCheck:
     """Check R and T, with T in each unit, by a sphere of known radius. The misfit is the RMS
     deviation from a sphere, mm, inf where none of about that size is detected. Raises InputError
     where no direction shows one."""
@@ -156,7 +156,9 @@ def check_sphere(name: str, rig: StereoRig, phase: PhaseMap, radius_mm: float) -
     return msgspec.structs.replace(_make_check(name, "sphere", fits), unit="mm")
 
 
-def check_single_axis(name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]) -> TransformCheck:
+def check_by_single_axis(
+    name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]
+) -> TransformCheck:
     """Check R and T by a capture with one axis, which contradicts them where points lie behind a
     device or outside of the projector's field, and confirms nothing."""
     depths, share = measure_single_axis(phases, rig)
@@ -171,7 +173,7 @@ def check_single_axis(name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]
 
 
 def _make_check(
-    name: str, evidence: Evidence, fits: Fits, depth_mm: float | None = None
+    name: str, evidence: Compared, fits: Fits, depth_mm: float | None = None
 ) -> TransformCheck:
     """Return the record of what the fits to a capture say."""
     answer, remedy = conclude_fits(fits)

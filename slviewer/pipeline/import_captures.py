@@ -566,7 +566,7 @@ def _check_principal_points(
             continue
         warn(
             f"the {device}'s principal point ({cx:.0f}, {cy:.0f}) lies outside of its"
-            f" {width}x{height} px: the lens is shifted, or the calibration was made at another"
-            " pixel scale; import a capture with patterns along both axes, and the calibration"
-            " after it: the patterns then tell"
+            f" {width}x{height} px: the lens is shifted, camera and projector are exchanged in the"
+            " file, or it is of another pixel scale; import a capture with patterns along both"
+            " axes, and the calibration after it: the patterns then tell"
         )

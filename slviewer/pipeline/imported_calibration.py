@@ -12,10 +12,10 @@ from slviewer.calibration.board_pose import solve_pose
 from slviewer.calibration.observe import observe
 from slviewer.errors import DetectionError, InputError
 from slviewer.evaluation.transform_hypotheses import (
-    check_axes,
-    check_board,
-    check_single_axis,
-    check_sphere,
+    check_by_axes,
+    check_by_board,
+    check_by_single_axis,
+    check_by_sphere,
 )
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
@@ -81,7 +81,7 @@ def check_capture_axes(capture: Capture, rig: StereoRig) -> TransformCheck | Non
     if len(capture.sequence.axes) < 2 or sizes != (rig.camera.size, rig.projector.size):
         return None
     try:
-        return check_axes(capture.name, rig, match_second(capture, decode_capture(capture)))
+        return check_by_axes(capture.name, rig, match_second(capture, decode_capture(capture)))
     except InputError as error:
         return TransformCheck(
             capture=capture.name, answer="undecided", evidence="two axes", remedy=str(error)
@@ -103,7 +103,7 @@ def confirm_by_captures(captures: Iterable[Capture], rig: StereoRig) -> tuple[Tr
     for capture in [each for each in singles if each.second is None and not checks][:1]:
         phases = decode_capture(capture, relative=True)
         if not any(phase.is_relative for phase in phases.values()):
-            checks.append(check_single_axis(capture.name, rig, phases))
+            checks.append(check_by_single_axis(capture.name, rig, phases))
     if checks and checks[-1].failure:
         raise InputError(checks[-1].failure)
     return tuple(checks)
@@ -142,7 +142,7 @@ def check_imported(job: Job, name: str, target: str, radius_mm: float | None) ->
     check = None
     if radius_mm is not None:
         best = max(phases.values(), key=lambda phase: np.count_nonzero(phase.mask))
-        check = check_sphere(name, rig, best, radius_mm)
+        check = check_by_sphere(name, rig, best, radius_mm)
     elif notation := target or find_target(store):
         try:
             check = _check_on_board(name, rig, notation, capture_texture(shot, look.stack), phases)
@@ -151,7 +151,7 @@ def check_imported(job: Job, name: str, target: str, radius_mm: float | None) ->
                 raise
     if check is None:
         whole = len(phases) > 1
-        check = (check_axes if whole else check_single_axis)(name, rig, phases)
+        check = (check_by_axes if whole else check_by_single_axis)(name, rig, phases)
     if check.answer == "undecided" and not check.remedy:
         check = msgspec.structs.replace(check, remedy=REMEDY)
     return _complete(store, check)
@@ -172,4 +172,4 @@ def _check_on_board(
             f"{name}: the board is {off_px:.1f} px beside where the camera's matrix can have it:"
             " check the board's notation, and the matrix and distortion of the camera"
         )
-    return check_board(name, rig, points, observation.projector)
+    return check_by_board(name, rig, points, observation.projector)

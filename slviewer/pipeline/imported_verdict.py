@@ -9,7 +9,7 @@ from slviewer.records.record import from_plain
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.session.store import Session
 
-TRUTH = "the simulation's truth"
+SIMULATED_TRUTH = "the simulation's truth"
 """Source of a stereo calibration that needs no check."""
 NEAR_MM = 150.0
 """Surfaces nearer than this make a unit doubtful that nothing states: few rigs focus there, and
@@ -33,7 +33,7 @@ def judge_imported(store: Session) -> Verdict | None:
     if not store.has_result("calibration/stereo"):
         return None
     meta = store.load_meta("calibration/stereo")
-    if "imported" not in meta or meta["source"] == TRUTH:
+    if "imported" not in meta or meta["source"] == SIMULATED_TRUTH:
         return None
     checks = list_transform_checks(store)
     agreeing = [each for each in checks if each.is_good]

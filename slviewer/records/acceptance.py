@@ -38,14 +38,14 @@ def worst_decision(decisions: Collection[Decision]) -> Decision:
     return next((each for each in ("fail", "undecided") if each in decisions), "pass")
 
 
-LEAST_MEASURED = 0.85
+LEAST_SURFACE = 0.85
 """Share of the visible surface that a pass takes: a bar before a ball may cover a tenth of it."""
 MAX_STRAYS = 0.02
 """Share of the points that a fit may exclude although they depart together by more than a
 limit."""
 
 
-class Evidence(msgspec.Struct, frozen=True):
+class SurfaceEvidence(msgspec.Struct, frozen=True):
     """What the figures of a ball or a plane rest on: the share of its visible surface that was
     ``measured``, and that something before it ``covered``; the share of the measured points that
     the fit ``excluded``; the lowest and the highest deviation that neighbouring points share."""
@@ -63,11 +63,11 @@ class Evidence(msgspec.Struct, frozen=True):
 
     def explain_gap(self, limit_mm: float) -> str:
         """Return why no pass within a limit follows from this; empty where one may."""
-        if self.measured < LEAST_MEASURED:
+        if self.measured < LEAST_SURFACE:
             covered = f", {100 * self.covered:.0f} % is covered" if self.covered >= 0.01 else ""
             return (
                 f"{100 * self.measured:.0f} % of the visible surface was measured{covered}, and a"
-                f" pass takes {100 * LEAST_MEASURED:.0f} %"
+                f" pass takes {100 * LEAST_SURFACE:.0f} %"
             )
         if self.excluded > MAX_STRAYS and self.range_mm > limit_mm:
             return (
@@ -116,7 +116,7 @@ class PositionErrors(msgspec.Struct, frozen=True):
     noise_mm: float = 0.0
     incidence: dict[str, float] | None = None
     warnings: list[str] = []
-    evidence: list[Evidence] = []
+    evidence: list[SurfaceEvidence] = []
     centres_mm: list[Vector] = []
 
     def explain_gap(self, limit_mm: float) -> str:

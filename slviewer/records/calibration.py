@@ -392,7 +392,7 @@ class ModelCalibration(Record, frozen=True, kw_only=True):
 
 
 Answer = Literal["agrees", "disagrees", "undecided"]
-Evidence = Literal["two axes", "board", "sphere", "single axis"]
+Compared = Literal["two axes", "board", "sphere", "single axis"]
 
 
 class TransformCheck(Record, frozen=True, kw_only=True):
@@ -413,7 +413,7 @@ class TransformCheck(Record, frozen=True, kw_only=True):
     has_figures = False
     capture: str
     answer: Answer
-    evidence: Evidence
+    evidence: Compared
     misfit: float | None = None
     limit: float = 0.0
     unit: Literal["px", "mm"] = "px"

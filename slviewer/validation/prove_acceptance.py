@@ -26,13 +26,13 @@ CASES = 40
 """Of each fault, at scale 1."""
 GRAZING = np.cos(np.radians(75.0))
 """Surfaces that are seen or lit less steeply are not measured."""
-VISIBLE = np.cos(np.radians(45.0))
+FACING = np.cos(np.radians(45.0))
 """Faults are put where both devices see the surface this steeply."""
 RADIUS_MM, SPACING_MM, SIDE_MM = 19.05, 100.0, 130.0
 MOST_FALSE_FAILS, MOST_UNDECIDED = 0.005, 0.02
 
 
-def simulated_rig(pixels: int) -> StereoRig:
+def make_rig(pixels: int) -> StereoRig:
     """Return a rig whose camera has so many columns, with its projector 180 mm beside it."""
     size = pixels, 3 * pixels // 4
     centre = [(each - 1) / 2 for each in size]
@@ -50,7 +50,8 @@ class Situation:
 
     ``radii`` of its balls; ``height``: of a plate, mm towards the camera, at its own coordinates
     (..., 2) mm. ``covered``: share of each feature that is not measured, on the side of its fault;
-    ``lost``: share of the pixels that are not, anywhere; ``turned``: the projector since the calibration, rad; ``same_place``: all positions are one.
+    ``lost``: share of the pixels that are not, anywhere; ``turned``: the projector since the
+    calibration, rad; ``same_place``: all positions are one.
     """
 
     kind: str
@@ -118,7 +119,7 @@ def _visible_direction(rng: np.random.Generator) -> Floats:
     while True:
         side = unit_vectors(rng.normal(size=3) - [0, 0, 2.0])
         to_projector = unit_vectors(np.array([0.3, 0.0, -1.0]))
-        if min(-side[2], side @ to_projector) > VISIBLE:
+        if min(-side[2], side @ to_projector) > FACING:
             return np.asarray(side)
 
 
@@ -167,14 +168,14 @@ def _bend(
 
 
 @dataclass(frozen=True)
-class Capture:
+class ArtefactView:
     """The true surface (h, w, 3) mm, and which feature each pixel shows, 0 for none."""
 
     points: Floats
     features: np.ndarray
 
 
-def view_balls(rig: StereoRig, centres: Floats, situation: Situation) -> Capture:
+def view_balls(rig: StereoRig, centres: Floats, situation: Situation) -> ArtefactView:
     """Return what the camera sees of balls at ``centres`` (n, 3) mm, lit by the projector."""
     rays = np.dstack([rig.camera.rays(), np.ones(rig.camera.size[::-1])])
     depth = np.full(rays.shape[:2], np.inf)
@@ -198,7 +199,7 @@ def view_balls(rig: StereoRig, centres: Floats, situation: Situation) -> Capture
         along = (points - centre) @ situation.side
         hidden = shown & (along > np.quantile(along[shown], 1 - situation.covered))
         points[hidden & (situation.covered > 0)] = np.nan
-    return Capture(points, features)
+    return ArtefactView(points, features)
 
 
 def _constant(radius: float) -> Radius:
@@ -212,7 +213,7 @@ def _meet_sphere(rays: Floats, centre: Floats, radius: Floats) -> Floats:
         return np.asarray((b - np.sqrt(b**2 - rr * (centre @ centre - radius**2))) / rr)
 
 
-def view_plate(rig: StereoRig, T: Floats, situation: Situation) -> Capture:
+def view_plate(rig: StereoRig, T: Floats, situation: Situation) -> ArtefactView:
     """Return what the camera sees of a square plate at T_camera_plate (4, 4)."""
     rays = np.dstack([rig.camera.rays(), np.ones(rig.camera.size[::-1])])
     height = np.zeros(rays.shape[:2])
@@ -222,12 +223,12 @@ def view_plate(rig: StereoRig, T: Floats, situation: Situation) -> Capture:
         xy = (rays * z[..., None] - T[:3, 3]) @ T[:3, :2]
         height = situation.height(xy)
     inside = (np.abs(xy) < SIDE_MM / 2).all(axis=2)
-    return Capture(rays * np.where(inside, z, np.nan)[..., None], inside.astype(int))
+    return ArtefactView(rays * np.where(inside, z, np.nan)[..., None], inside.astype(int))
 
 
 def capture_places(
     rig: StereoRig, situation: Situation, rng: np.random.Generator
-) -> Iterator[Capture]:
+) -> Iterator[ArtefactView]:
     """Yield the artefact in each position of a test."""
     for i in range(6 if situation.kind == "plate" else 7):
         z = rng.uniform(480.0, 640.0) if not situation.same_place else 560.0
@@ -320,7 +321,7 @@ def _list_errors(points: Floats, features: np.ndarray, situation: Situation) -> 
 
 def prove_acceptance(scale: float, seed: int, progress: Progress) -> Proof:
     """Test artefacts that are right, wrong, or not seen whole; none that is not right passes."""
-    rig, counts = simulated_rig(320), dict[str, Counter[tuple[str, str]]]()
+    rig, counts = make_rig(320), dict[str, Counter[tuple[str, str]]]()
     cases = max(2, round(CASES * scale))
     for fault, number, report in track(progress, {each: i for i, each in enumerate(FAULTS)}):
         counts[fault] = Counter()

@@ -12,10 +12,10 @@ import pytest
 from slviewer.errors import InputError
 from slviewer.evaluation.transform_hypotheses import (
     UNITS_MM,
-    check_axes,
-    check_board,
-    check_single_axis,
-    check_sphere,
+    check_by_axes,
+    check_by_board,
+    check_by_single_axis,
+    check_by_sphere,
 )
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.geometry.lens import Lens
@@ -91,18 +91,18 @@ def stated(rig: StereoRig, direction: str, unit: str) -> StereoRig:
 def check(scene: Scene, rig: StereoRig, evidence: str, rng: np.random.Generator):
     axes = {each: phase_map(scene, each) for each in ("x", "y")}
     if evidence == "two axes":
-        return check_axes("a", rig, axes)
+        return check_by_axes("a", rig, axes)
     if evidence.startswith("board"):
         at = rng.integers(0, scene.points.size // 3, 150)
         measured = scene.measured.reshape(-1, 2)[at]
         if evidence == "board x":
             measured[:, 1] = np.nan
         points = scene.points.reshape(-1, 3)[at] * rng.normal(1, 0.003)
-        return check_board("a", rig, points, measured)
+        return check_by_board("a", rig, points, measured)
     if evidence == "sphere":
         baseline_along_x = abs(scene.rig.t[0]) > abs(scene.rig.t[1])
-        return check_sphere("a", rig, axes["x" if baseline_along_x else "y"], scene.ball[1])
-    return check_single_axis("a", rig, {evidence[0]: axes[evidence[0]]})
+        return check_by_sphere("a", rig, axes["x" if baseline_along_x else "y"], scene.ball[1])
+    return check_by_single_axis("a", rig, {evidence[0]: axes[evidence[0]]})
 
 
 def count(seeds: range, evidences: tuple[str, ...]) -> Counter:

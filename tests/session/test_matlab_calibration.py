@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slviewer.session.importers.filestorage import Storage, read_storage
-from slviewer.session.importers.matlab_calibration import read_sizes, read_unit
+from slviewer.session.importers.matlab_calibration import read_image_sizes, read_unit
 from slviewer.session.importers.opencv_calibration import identify_keys, read_matrices
 
 K1 = np.array([[530.0, 0, 120], [0, 531.0, 88], [0, 0, 1]])
@@ -66,7 +66,7 @@ def test_structs_are_recognised(tmp_path: Path, name: str) -> None:
     storage = read_storage(tmp_path / "rig.json")
     check_matrices(read_matrices(storage))
     assert read_unit(storage) == "mm"
-    assert {device: size for device, (size, _) in read_sizes(storage).items()} == {
+    assert {device: size for device, (size, _) in read_image_sizes(storage).items()} == {
         "camera": (240, 180), "projector": (240, 180)
     }  # fmt: skip
 

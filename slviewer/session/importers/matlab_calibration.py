@@ -88,7 +88,7 @@ def is_transposed(K: np.ndarray) -> bool:
     return K.shape == (3, 3) and bool(K[2, :2].all()) and not K[:2, 2].any()
 
 
-def read_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
+def read_image_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
     """{"camera" or "projector": (its size (width, height) px, the key that states it)}."""
     sizes = {}
     for key, value in storage.entries.items():

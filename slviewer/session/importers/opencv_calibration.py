@@ -112,7 +112,7 @@ def read_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
             if values.shape == (2,) and (values >= 1).all() and (values == values.round()).all():
                 sizes[device] = (int(values[0]), int(values[1])), " and ".join(keys)
                 break
-    return sizes or matlab_calibration.read_sizes(storage)
+    return sizes or matlab_calibration.read_image_sizes(storage)
 
 
 def _list_keys(storage: Storage) -> str:
