@@ -3,6 +3,7 @@ board, or a sphere of known size. The session stores them, and the verdict on th
 on them."""
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 
 import msgspec
@@ -62,10 +63,12 @@ def check_calibration(job: Job) -> None:
 def confirm_imported(store: Session) -> None:
     """Check an imported calibration by the session's captures with both axes, until one agrees; the
     session stores the checks."""
-    verdict = judge_imported(store)
-    if verdict is None or verdict.level == "good" or not store.is_writable:
+    if judge_imported(store) is None or not store.is_writable:
         return
-    done = [check.inputs for check in list_transform_checks(store)]
+    checks = list_transform_checks(store)
+    if any(check.is_good for check in checks):
+        return
+    done = [check.inputs for check in checks]
     for capture in store.captures(with_frames=True):
         if not any(inputs.get(capture.name) == capture.hash for inputs in done):
             check = check_capture_axes(capture, load_stereo(store).rig)
@@ -98,11 +101,11 @@ def confirm_by_captures(captures: Iterable[Capture], rig: StereoRig) -> tuple[Tr
             checks.append(check)
             if check.answer != "undecided":
                 break
-        elif len(capture.sequence.axes) == 1 and capture.size == rig.camera.size:
+        elif capture.second is None and capture.size == rig.camera.size:
             singles.append(capture)
-    for capture in [each for each in singles if each.second is None and not checks][:1]:
-        phases = decode_capture(capture, relative=True)
-        if not any(phase.is_relative for phase in phases.values()):
+    for capture in singles[: 0 if checks else 1]:
+        with suppress(InputError):  # phases that are not absolute, or too dark
+            phases = decode_capture(capture)
             checks.append(check_by_single_axis(capture.name, rig, phases))
     if checks and checks[-1].failure:
         raise InputError(checks[-1].failure)

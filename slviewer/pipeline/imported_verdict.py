@@ -36,6 +36,8 @@ def judge_imported(store: Session) -> Verdict | None:
     if "imported" not in meta or meta["source"] == SIMULATED_TRUTH:
         return None
     checks = list_transform_checks(store)
+    measured = [each for each in checks if each.scale is not None and each.answer != "undecided"]
+    checks = measured[-1:] or checks  # the last one that knows a length decides
     agreeing = [each for each in checks if each.is_good]
     contradicting = [each for each in checks if each.answer == "disagrees"]
     if not agreeing and contradicting:

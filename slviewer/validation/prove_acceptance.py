@@ -230,8 +230,9 @@ def capture_places(
     rig: StereoRig, situation: Situation, rng: np.random.Generator
 ) -> Iterator[ArtefactView]:
     """Yield the artefact in each position of a test."""
-    for i in range(6 if situation.kind == "plate" else 7):
-        z = rng.uniform(480.0, 640.0) if not situation.same_place else 560.0
+    count = 6 if situation.kind == "plate" else 7
+    for i, near in enumerate(np.linspace(480.0, 640.0, count)):
+        z = 560.0 if situation.same_place else near + rng.uniform(-8.0, 8.0)
         away = 0.0 if situation.same_place else 1.0
         middle = away * rng.uniform(-0.05, 0.05, 2) * z
         turn = rng.normal(0, 0.2 * away, 3)

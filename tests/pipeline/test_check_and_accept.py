@@ -18,7 +18,9 @@ from slviewer.pipeline.accept import REFERENCE, accept, check, load_drift_histor
 from slviewer.pipeline.cloud_corrections import scale_factor
 from slviewer.pipeline.imported_verdict import judge_imported, list_transform_checks
 from slviewer.pipeline.models import load_stereo
+from slviewer.pipeline.operation import next_name, save_record
 from slviewer.pipeline.simulate import save_true_stereo
+from slviewer.records.calibration import TransformCheck
 from slviewer.session.store import Session
 from slviewer.simulation.boards import printed_board
 from slviewer.simulation.plans import rotation, target_poses
@@ -233,3 +235,27 @@ def test_a_board_along_one_axis_checks_an_imported_calibration(tmp_path, changes
     assert found.answer == ("disagrees" if facts else "agrees"), found.summary()
     assert level == ("rejected" if facts else "good") and not missing_facts(found.remedy, *facts)
     assert found.scale == pytest.approx(1 / changes.get("T", 1.0), rel=0.01) or "inverted" in facts
+
+
+def test_the_last_check_that_knows_a_length_decides(bare):
+    with Session.open(bare, write=True) as store:
+        meta = store.load_meta("calibration/stereo")
+        given = {key: meta[key] for key in ("imported", "camera", "projector", "inputs")}
+        store.save_result("calibration/stereo", {**given, "source": "rig.yml"}, {})
+        inputs = store.input_hashes("calibration/stereo")
+
+        def level(answer: str, evidence: str, scale: float | None) -> str:
+            found = TransformCheck(
+                capture="a", answer=answer, evidence=evidence, scale=scale, inputs=inputs,
+                depth_mm=600.0,
+            )  # fmt: skip
+            save_record(store, next_name(store, TransformCheck), found, {})
+            return judge_imported(store).level
+
+        assert judge_imported(store).level == "doubtful"
+        assert level("undecided", "single axis", None) == "doubtful"
+        assert level("disagrees", "two axes", None) == "rejected"
+        assert level("agrees", "two axes", None) == "good"
+        assert level("disagrees", "board", 10.0) == "rejected"
+        assert level("agrees", "two axes", None) == "rejected"
+        assert level("agrees", "sphere", 1.0) == "good"
