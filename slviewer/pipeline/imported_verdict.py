@@ -6,11 +6,15 @@ import numpy as np
 
 from slviewer.records.calibration import TransformCheck
 from slviewer.records.record import from_plain
-from slviewer.records.verdict import Finding, Verdict
+from slviewer.records.verdict import Finding, Severity, Verdict
 from slviewer.session.store import Session
 
 SIMULATED_TRUTH = "the simulation's truth"
 """Source of a stereo calibration that needs no check."""
+MEASURING = (
+    "capture its board and run `slviewer check SESSION CAPTURE --target BOARD`, or a sphere of"
+    " known size, with --radius MM"
+)
 NEAR_MM = 150.0
 """Surfaces nearer than this make a unit doubtful that nothing states: few rigs focus there, and
 most that are taken for mm instead of cm or inches."""
@@ -43,30 +47,24 @@ def judge_imported(store: Session) -> Verdict | None:
     if not agreeing and contradicting:
         last = contradicting[-1]
         return Verdict.of([Finding("transform", "rejected", last.sentence, last.remedy)])
-    file = Path(meta["source"]).name
-    baseline = f"baseline {np.linalg.norm(meta['imported']['T']):.1f} mm"
-    measuring = (
-        "capture its board and run `slviewer check SESSION CAPTURE --target BOARD`, or a sphere of"
-        " known size, with --radius MM"
-    )
+    file, baseline = Path(meta["source"]).name, np.linalg.norm(meta["imported"]["T"])
     if not agreeing:
         sentence = (
-            f"calibration not checked: no capture has confirmed R and T of {file}, {baseline},"
-            " which may be inverted, transposed or in another unit"
+            f"calibration not checked: no capture has confirmed R and T of {file}, baseline"
+            f" {baseline:.1f} mm, which may be inverted, transposed or in another unit"
         )
-        remedy = f"reconstruct a capture with patterns along both axes; or {measuring}"
+        remedy = f"reconstruct a capture with patterns along both axes; or {MEASURING}"
         return Verdict.of([Finding("transform", "doubtful", sentence, remedy)])
-    if meta.get("unit") or any(each.scale for each in agreeing):
+    if meta.get("unit") or measured:
         return Verdict()
-    depths = [each.depth_mm for each in agreeing if each.depth_mm]
-    is_near = bool(depths) and min(depths) < NEAR_MM
-    seen = f", and by that the surfaces lie at {min(depths):.0f} mm" if depths else ""
+    depth_mm = min((each.depth_mm for each in agreeing if each.depth_mm), default=np.inf)
     sentence = (
-        f"unit not checked: T of {file} is taken to be in mm, as nothing states its unit"
-        f" ({baseline}{seen})"
+        f"unit not checked: T of {file} is taken to be in mm, as nothing states its unit (baseline"
+        f" {baseline:.1f} mm, and by that the surfaces lie at {depth_mm:.0f} mm)"
     )
-    remedy = f"import it with its --unit; or {measuring}"
-    return Verdict.of([Finding("transform", "doubtful" if is_near else "note", sentence, remedy)])
+    severity: Severity = "doubtful" if depth_mm < NEAR_MM else "note"
+    remedy = f"import it with its --unit; or {MEASURING}"
+    return Verdict.of([Finding("transform", severity, sentence, remedy)])
 
 
 def warning_of_imported(store: Session) -> str:
