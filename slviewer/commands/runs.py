@@ -378,6 +378,8 @@ def run_frames(import_captures: Function, arguments: Arguments) -> None:
 def run_import_calibration(import_calibration: Function, arguments: Arguments) -> None:
     """Import a calibration, and print what was read from its file."""
     from slviewer.pipeline.import_captures import identify_calibration_keys
+    from slviewer.pipeline.imported_verdict import judge_imported
+    from slviewer.pipeline.operation import opened
 
     if arguments["keys"] is None:
         identified = identify_calibration_keys(arguments["file"])
@@ -394,6 +396,10 @@ def run_import_calibration(import_calibration: Function, arguments: Arguments) -
         f"stereo calibration imported: camera {cw}x{ch}, projector {pw}x{ph}, baseline"
         f" {model.baseline_mm:.1f} mm"
     )
+    with opened(arguments["session"]) as store:
+        verdict = judge_imported(store)
+        for finding in () if verdict is None or verdict.level != "good" else verdict.findings:
+            terminal.print_result(finding.text())
 
 
 def _make_captures_command(

@@ -9,8 +9,8 @@ are where the true error lies with 95 % (99.7 %) probability, by the test's own 
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
-from math import hypot
+from itertools import combinations, permutations
+from math import dist, hypot
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from slviewer.errors import InputError
+from slviewer.evaluation.artefact_evidence import collect_evidence
 from slviewer.evaluation.fit import (
     ShapeResult,
     evaluate_plane,
@@ -25,6 +26,7 @@ from slviewer.evaluation.fit import (
     finite_or_none,
     incidence,
 )
+from slviewer.geometry.shapes import Sphere
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import (
@@ -36,9 +38,10 @@ from slviewer.records.acceptance import (
     PropertyError,
     ScaleError,
     StillCaptures,
+    SurfaceEvidence,
     worst_decision,
 )
-from slviewer.records.record import from_plain
+from slviewer.records.record import from_plain, to_vector
 
 Kind = Literal["ball-bar", "sphere", "plane"]
 BALLS = {"ball-bar": 2, "sphere": 1, "plane": 0}
@@ -205,16 +208,23 @@ def narrowest_range(deviations: np.ndarray, share: float) -> float:
     return float((values[inside - 1 :] - values[: len(values) - inside + 1]).min())
 
 
-def make_form_error(name: str, position: str, deviations: np.ndarray, U_mm: float) -> PropertyError:
-    """Return the error of form from points' deviations (n,) mm from their shape."""
-    inner, outer = narrowest_range(deviations, 0.95), narrowest_range(deviations, 0.997)
-    return PropertyError(name, position, inner, U_mm, (0.0, inner), (0.0, outer))
+def make_form_error(
+    name: str, position: str, shown: ShapeResult, evidence: SurfaceEvidence, U_mm: float
+) -> PropertyError:
+    """Return the error of form from points' deviations from their shape: the range of 95 % of
+    them, or that which neighbours share, if that is wider."""
+    inner, outer = (narrowest_range(shown.error_map, share) for share in (0.95, 0.997))
+    noise = finite_or_none(shown.noise_floor_mm) or shown.rms_mm
+    error = max(inner, evidence.range_mm)
+    return PropertyError(
+        name, position, error, U_mm, (0.0, inner), (0.0, outer), U_mm + 2 * K_95 * noise
+    )
 
 
 def make_length_error(name: str, position: str, error_mm: float, u_mm: float) -> PropertyError:
     """Return the error of a length with its standard uncertainty."""
     inner, outer = ((error_mm - k * u_mm, error_mm + k * u_mm) for k in (K_95, K_997))
-    return PropertyError(name, position, error_mm, 2 * u_mm, inner, outer)
+    return PropertyError(name, position, error_mm, 2 * u_mm, inner, outer, 2 * u_mm)
 
 
 def decide(figures: Sequence[PropertyError], limit_mm: float) -> Decision:
@@ -233,20 +243,23 @@ def measure_artefact(
     capture: str,
     depth_range: tuple[float, float] | None = None,
     plate: np.ndarray | None = None,
+    projector: np.ndarray | None = None,
 ) -> PositionErrors:
-    """Measure the figures of one position. ``plate`` (h, w) bool: the plane's pixels, if these are
-    known.
+    """Measure the figures of one position. ``plate`` (h, w) bool: the plane's pixels, ``projector``
+    (3,) mm: its centre, if these are known.
 
     Raises InputError where the artefact is not found in the cloud.
     """
     if artefact.kind == "plane":
         shown = [evaluate_plane(cloud.points, plate, cloud.sigma_z)]
-        figures = [make_form_error(FLATNESS, position, shown[0].error_map, artefact.form_U_mm)]
+        evidence = [collect_evidence(shown[0], cloud.points, projector, plate)]
+        figures = [make_form_error(FLATNESS, position, shown[0], evidence[0], artefact.form_U_mm)]
         noise = 0.0
     else:
         nominal = float(np.mean([diameter.value for diameter in artefact.diameters])) / 2
         shown = evaluate_spheres(cloud.points, len(artefact.diameters), cloud.sigma_z, nominal)
-        figures, noise = _measure_balls(artefact, cloud, shown, position)
+        evidence = [collect_evidence(ball, cloud.points, projector) for ball in shown]
+        figures, noise = _measure_balls(artefact, cloud, shown, evidence, position)
     region = np.logical_or.reduce([np.isfinite(result.error_map) for result in shown])
     return PositionErrors(
         position=position,
@@ -258,11 +271,17 @@ def measure_artefact(
         noise_mm=noise,
         incidence=None if depth_range is None else incidence(cloud.points, region, depth_range),
         warnings=[result.warning for result in shown if result.warning],
+        evidence=evidence,
+        centres_mm=[to_vector(s.shape.centre) for s in shown if isinstance(s.shape, Sphere)],
     )
 
 
 def _measure_balls(
-    artefact: Artefact, cloud: Cloud, balls: list[ShapeResult], position: str
+    artefact: Artefact,
+    cloud: Cloud,
+    balls: list[ShapeResult],
+    evidence: list[SurfaceEvidence],
+    position: str,
 ) -> tuple[list[PropertyError], float]:
     """The figures of one ball or two, and the noise of a length between their centres (of a
     diameter, for one)."""
@@ -274,8 +293,8 @@ def _measure_balls(
     )
     spreads = [_fit_covariance(cloud.points, ball) for ball in balls]
     figures = []
-    for ball, (diameter, u), spread in zip(balls, known, spreads, strict=True):
-        figures.append(make_form_error(FORM, position, ball.error_map, artefact.form_U_mm))
+    for ball, proof, (diameter, u), spread in zip(balls, evidence, known, spreads, strict=True):
+        figures.append(make_form_error(FORM, position, ball, proof, artefact.form_U_mm))
         u_size = float(np.hypot(u, 2 * np.sqrt(spread[3, 3])))
         figures.append(make_length_error(SIZE, position, 2 * ball.radius_mm - diameter, u_size))
     if artefact.spacing is None:
@@ -306,12 +325,15 @@ def conclude_test(
             f"no capture shows {artefact.name}: name some in [measured] captures of its file"
         )
     figures = [figure for position in positions for figure in position.figures]
-    judgements = list[JudgedProperty]()
+    judgements, gaps = list[JudgedProperty](), dict[str, str]()
     for name, key in LIMITS.items():
         limit_mm = getattr(artefact.limits, key)
         if mine := [figure for figure in figures if figure.property == name]:
             worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
             decision = None if limit_mm is None else decide(mine, limit_mm)
+            if limit_mm is not None and decision == "pass":
+                gaps |= {p.position: gap for p in positions if (gap := p.explain_gap(limit_mm))}
+                decision = "undecided" if gaps else decision
             judgements.append(JudgedProperty(name, worst, limit_mm, decision))
     decisions = {each.decision for each in judgements if each.decision is not None}
     return AcceptanceTest(
@@ -321,7 +343,10 @@ def conclude_test(
         judgements=judgements,
         scale=_estimate_scale(artefact, positions),
         decision=worst_decision(decisions) if decisions else None,
-        lacks=list(_list_gaps(artefact, positions)),
+        lacks=[
+            *(f"{position}: {gap}" for position, gap in gaps.items()),
+            *_list_gaps(artefact, positions),
+        ],
     )
 
 
@@ -330,6 +355,11 @@ def _list_gaps(artefact: Artefact, positions: Sequence[PositionErrors]) -> Itera
     needed = POSITIONS[artefact.kind]
     if len(positions) < needed:
         yield f"{len(positions)} of {needed} positions were measured"
+    for first, second in combinations(positions, 2):
+        pairs = zip(first.centres_mm, second.centres_mm, strict=True)
+        nearest = min((diameter.value for diameter in artefact.diameters), default=0.0) / 8
+        if first.centres_mm and all(dist(a, b) < nearest for a, b in pairs):
+            yield f"{first.position} and {second.position} are the same place"
     shares = [position.incidence for position in positions if position.incidence]
     for part in ("R1", "R3") if shares else ():
         if not any(share[part] >= OUTSIDE for share in shares):

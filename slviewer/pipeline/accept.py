@@ -45,18 +45,19 @@ from slviewer.pipeline.capture_phases import (
     match_second,
 )
 from slviewer.pipeline.cloud_corrections import record_scale, scale_factor
+from slviewer.pipeline.imported_calibration import check_calibration, check_imported
 from slviewer.pipeline.models import (
     MODELS,
     Model,
     ModelName,
     available_models,
-    check_calibration,
+    device_centres,
     load_model,
     load_pair,
     load_stereo,
     preferred_model,
     warn_if_frame_changed,
-    warn_if_stale,
+    warn_of_calibration,
 )
 from slviewer.pipeline.operation import (
     Found,
@@ -83,7 +84,7 @@ from slviewer.records.acceptance import (
     ModelComparison,
     PositionErrors,
 )
-from slviewer.records.calibration import ModelCalibration
+from slviewer.records.calibration import ModelCalibration, TransformCheck
 from slviewer.session.reading import read_toml
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -172,13 +173,16 @@ def _measure_positions(
     """Measure the artefact at each position, {capture: position}."""
     positions = list[PositionErrors]()
     depth_range = load_stereo(job.store).depth_range_mm
+    projector = next((centres[1] for centres in device_centres(job.store)), None)
     for shot, frames, cloud in reconstruct_captures(job, chosen, list(captures), "measuring"):
         plate, name = None, shot.name
         if certified.kind == "plane" and shot.role == "calibration":
             plate = segment_board(job.store, shot, capture_texture(shot, frames), job.warn)
         try:
             positions.append(
-                measure_artefact(certified, cloud, captures[name], name, depth_range, plate)
+                measure_artefact(
+                    certified, cloud, captures[name], name, depth_range, plate, projector
+                )
             )
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
@@ -245,32 +249,41 @@ class CheckSettings:
     """What a calibration is checked with.
 
     Args:
-        capture: Name of a capture, of any role, that shows the calibration's board.
+        capture: Name of a capture, of any role, that shows the calibration's board; for one that
+            was imported, of anything with patterns along both axes, of a board or of a sphere.
+        target: For an imported calibration: the board in view; by default the session's.
+        radius: For an imported calibration: radius of the sphere in view, mm.
     """
 
     capture: str
+    target: str = ""
+    radius: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.radius is not None and not self.radius > 0:
+            raise UsageError(f"a radius of {self.radius:g} mm is not possible: give a positive one")
 
 
-@operation("check", Drift, CheckSettings)
-def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
+@operation("check", Drift, CheckSettings, others=(TransformCheck,))
+def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift] | Found[TransformCheck]]:
     """Determine from one capture of the board whether the saved calibration is still good, and why
-    if it is not.
+    if it is not; of one that was imported, whether R and T have the direction and the unit that
+    they are taken to have.
 
-    The session stores the answer as ``drift/1``, ``drift/2``, ... Raises DetectionError where the
-    capture does not show the board, InputError where the calibration has too few poses for a
-    decision, or was made elsewhere.
+    The session stores the answer as ``drift/1``, ``drift/2``, ..., that on an imported calibration
+    as ``transform/1``, ... Raises DetectionError where the capture does not show the board,
+    InputError where the calibration has too few poses for a decision.
     """
     store, capture = job.store, settings.capture
     shot = store.load_capture(capture)
     shot.require_frames("check")
     stereo = load_stereo(store)
     if not stereo.poses:
-        raise InputError(
-            f"the calibration of {store.folder} was made elsewhere and has no poses: a drift check"
-            " needs them to know how well one board determines the projector's pose; run `slviewer"
-            " calibrate` first"
-        )
-    warn_if_stale(store, job.warn)
+        yield Found("", check_imported(job, capture, settings.target, settings.radius))
+        return
+    if settings.target or settings.radius:
+        raise UsageError("--target and --radius are for imported calibrations: omit them")
+    warn_of_calibration(store, job.warn)
     job.progress(0.0, f"reading {capture}")
     look = look_at_capture(shot)
     frames, decoded = look.stack, decode_capture(shot, look)
@@ -485,7 +498,7 @@ def validate(job: Job, settings: ValidateSettings) -> Iterator[Found[ModelCompar
         raise UsageError(
             f"no model is called {', '.join(settings.models)}: use {', '.join(MODELS)}"
         )
-    warn_if_stale(store, job.warn)
+    warn_of_calibration(store, job.warn)
     observations = load_observations(store, list(stereo.poses))
     if missing := sorted(set(stereo.poses) - {o.name for o in observations}):
         raise InputError(

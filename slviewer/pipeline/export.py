@@ -28,7 +28,7 @@ from slviewer.pipeline.models import (
     load_model,
     load_stereo,
     preferred_model,
-    warn_if_stale,
+    warn_of_calibration,
 )
 from slviewer.pipeline.operation import (
     Callbacks,
@@ -482,7 +482,7 @@ def export(settings: ExportSettings) -> Exported:
         if what not in ("report", "table"):
             check_accepted(store, settings.accept_rejected)
             if what not in _MERGES:  # reading a merge warns by itself
-                warn_if_stale(store, settings.warn)
+                warn_of_calibration(store, settings.warn)
         write = _write_document if what in _DOCUMENT_FORMATS else _write_shape
         words = write(store, name, target, settings)
     settings.progress(1.0, "exported")

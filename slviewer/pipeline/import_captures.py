@@ -7,7 +7,7 @@ when it is repeated. A calibration becomes the session's own once it agrees with
 session's captures.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
@@ -25,8 +25,10 @@ from slviewer.fringe.phase import Reason
 from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.capture_phases import decode_capture, decode_examined, match_second
+from slviewer.pipeline.capture_phases import decode_examined
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination, warn_of_exposure
+from slviewer.pipeline.imported_calibration import confirm_by_captures, save_check
+from slviewer.pipeline.imported_verdict import warning_of_imported
 from slviewer.pipeline.models import available_models, save_imported_stereo, trash_models
 from slviewer.pipeline.operation import (
     Callbacks,
@@ -37,9 +39,8 @@ from slviewer.pipeline.operation import (
     opened_or_made,
     takes_settings,
 )
-from slviewer.reconstruction.axis_agreement import check_phases
-from slviewer.session.capture import Capture, NewCapture, Role
-from slviewer.session.importers import opencv_calibration
+from slviewer.session.capture import NewCapture, Role
+from slviewer.session.importers import matlab_calibration, opencv_calibration
 from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.importers.guessed_frames import guess_description
 from slviewer.session.importers.images import Channel
@@ -60,6 +61,7 @@ from slviewer.session.importers.layouts import (
     layouts,
 )
 from slviewer.session.layout import is_session
+from slviewer.session.nominal import MM, Units
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 
@@ -444,6 +446,7 @@ def import_opencv_calibration(
     session: SessionLike,
     keys: Keys | None = None,
     *,
+    unit: Units | None = None,
     projector: Size | None = None,
     camera: Size | None = None,
     force: bool = False,
@@ -455,8 +458,10 @@ def import_opencv_calibration(
         file: The .yml, .xml or .json file.
         session: Session folder; made if it does not exist.
         keys: The file's names for the matrices K_camera D_camera K_projector D_projector R T; R and
-            T (mm) map camera to projector. By default the common names are recognised, and those
-            used are printed.
+            T map camera to projector. By default the common names are recognised, those of MATLAB's
+            parameters too, and those used are printed.
+        unit: Unit of T; by default what the file states, else mm, which is checked where a capture
+            shows a known length.
         projector: Width x height of the projector, px; by default what the file states, else the
             session's captures.
         camera: Width x height of the camera, px; by default what the file states, else the
@@ -467,12 +472,13 @@ def import_opencv_calibration(
     the trash with the stereo one that they were made from.
 
     Raises InputError, and replaces nothing, where sizes contradict each other, and where the
-    patterns of a capture in the session contradict the calibration: R and T inverted, matrices
-    exchanged or at another pixel scale, another rig.
+    patterns of a capture in the session contradict the calibration: R and T inverted or transposed,
+    matrices exchanged or at another pixel scale, another rig. Warns where no capture confirms it.
     """
     path = Path(file)
     storage = read_storage(path)
-    matrices = opencv_calibration.read_matrices(storage, keys)
+    unit = unit or matlab_calibration.read_unit(storage)
+    matrices = opencv_calibration.read_matrices(storage, keys, MM[unit or "mm"])
     stated = opencv_calibration.read_sizes(storage)
     with opened_or_made(session) as store:
         there = available_models(store)
@@ -496,13 +502,16 @@ def import_opencv_calibration(
         )
         rig = StereoRig(camera_lens, projector_lens, matrices["R"], matrices["T"])
         model = None if None in sizes.values() else StereoModel.from_rig(rig)
-        if model is None or not _is_confirmed(model, captures, warn):
-            for device, size in sizes.items():
-                if size is not None:
-                    _check_principal_point(device, matrices[f"K_{device}"], size, warn)
+        checks = () if model is None else confirm_by_captures(captures, model.rig)
+        if not any(check.is_good for check in checks):
+            _check_principal_points(matrices, sizes, warn)
         with store.together():
             trash_models(store, there)
-            save_imported_stereo(store, matrices, source=str(file), **sizes)
+            save_imported_stereo(store, matrices, source=str(file), unit=unit, **sizes)
+        for check in checks:
+            save_check(store, check)
+        if warning := warning_of_imported(store):
+            warn(warning)
         return model
 
 
@@ -544,32 +553,20 @@ def _resolve_size(
     return size
 
 
-def _is_confirmed(model: StereoModel, captures: Iterable[Capture], warn: Warn) -> bool:
-    """Whether a capture with both axes confirms the calibration; False without such a capture.
-    Raises InputError where one contradicts it."""
-    rig = model.rig
-    for capture in captures:
-        sequence = capture.sequence
-        is_same = (capture.size, capture.other_size) == (rig.camera.size, rig.projector.size)
-        if is_same and len(sequence.axes) > 1:
-            check = check_phases(
-                capture.name, match_second(capture, decode_capture(capture)), model
-            )
-            for message in check.warnings:
-                warn(message)
-            if check.agreement is not None:
-                return True
-    return False
-
-
-def _check_principal_point(device: str, K: np.ndarray, size: tuple[int, int], warn: Warn) -> None:
-    """Warn where the optical axis is outside of the image: a shifted lens, or another pixel
+def _check_principal_points(
+    matrices: Mapping[str, np.ndarray], sizes: Mapping[str, tuple[int, int] | None], warn: Warn
+) -> None:
+    """Warn where an optical axis is outside of its image: a shifted lens, or another pixel
     scale."""
-    (width, height), (cx, cy) = size, K[:2, 2]
-    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+    for device, size in sizes.items():
+        if size is None:
+            continue
+        (width, height), (cx, cy) = size, matrices[f"K_{device}"][:2, 2]
+        if -0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5:
+            continue
         warn(
             f"the {device}'s principal point ({cx:.0f}, {cy:.0f}) lies outside of its"
-            f" {width}x{height} px: the lens is shifted, or the calibration was made at another"
-            " pixel scale; import a capture with patterns along both axes, and the calibration"
-            " after it: the patterns then tell"
+            f" {width}x{height} px: the lens is shifted, camera and projector are exchanged in the"
+            " file, or it is of another pixel scale; import a capture with patterns along both"
+            " axes, and the calibration after it: the patterns then tell"
         )

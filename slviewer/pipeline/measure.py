@@ -19,10 +19,10 @@ from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane, section, triangulate_near
 from slviewer.inspection.uncertainty import PointErrors, Spread, splined_shared
 from slviewer.pipeline.cloud_corrections import load_scale_correction
+from slviewer.pipeline.imported_calibration import check_calibration
 from slviewer.pipeline.models import (
     ModelName,
     available_models,
-    check_calibration,
     device_centres,
     load_model,
     load_stereo,

@@ -26,10 +26,10 @@ from slviewer.pipeline.cloud_corrections import (
     restriction_notes,
 )
 from slviewer.pipeline.cloud_record import list_outside_depths
+from slviewer.pipeline.imported_calibration import check_calibration
 from slviewer.pipeline.models import (
     ModelName,
     check_accepted,
-    check_calibration,
     frame_of,
     load_model,
 )

@@ -15,7 +15,7 @@ from slviewer.pipeline.cloud_corrections import OFF, resolve_region, restriction
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.measure import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
-from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
+from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_of_calibration
 from slviewer.pipeline.operation import (
     Callbacks,
     Findings,
@@ -182,7 +182,7 @@ def mesh(settings: MeshSettings) -> MeshResult:
             stored, points = read_merge(store, f"merge/{name}", warn, settings.roi)
             shape, restrictions = points_with_normals(points), tuple(stored.restrictions)
         else:
-            warn_if_stale(store, warn)
+            warn_of_calibration(store, warn)
             shape = scan_cloud(job, sources[0], settings.model, settings.roi)
             restrictions = restriction_notes(store, sources, resolve_region(store, settings.roi))
         if texture is not None:

@@ -14,9 +14,9 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError, SessionError, SlviewerError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.imported_verdict import judge_imported, warning_of_imported
 from slviewer.pipeline.operation import (
     Found,
-    Job,
     SessionLike,
     Warn,
     load_record,
@@ -113,14 +113,16 @@ def save_imported_stereo(
     source: str,
     camera: tuple[int, int] | None,
     projector: tuple[int, int] | None,
+    unit: str | None = None,
 ) -> None:
     """Save imported matrices as the session's stereo calibration; sizes that are None follow from
-    its captures."""
+    its captures. ``unit``: that T was in, if that was stated."""
     meta = {
         "imported": {name: value.tolist() for name, value in matrices.items()},
         "source": source,
         "camera": camera,
         "projector": projector,
+        "unit": unit,
         "inputs": {},
     }
     store.save_result("calibration/stereo", meta, {})
@@ -398,8 +400,14 @@ def rejection_reason(store: Session) -> str:
     judged."""
     if "stereo" not in available_models(store):
         return ""
-    verdict = load_record(store, ModelCalibration, "stereo").verdict
+    verdict = load_stereo_verdict(store)
     return verdict.reason if verdict is not None and verdict.level == "rejected" else ""
+
+
+def load_stereo_verdict(store: Session) -> Verdict | None:
+    """Return the verdict on the session's stereo calibration; None where it was never judged."""
+    imported = judge_imported(store)
+    return imported or load_record(store, ModelCalibration, "stereo").verdict
 
 
 def check_accepted(store: Session, accept_rejected: bool = False) -> None:
@@ -410,13 +418,6 @@ def check_accepted(store: Session, accept_rejected: bool = False) -> None:
         raise CalibrationRejected(
             f"the calibration was rejected, and is not used without --accept-rejected: {reason}"
         )
-
-
-def check_calibration(job: Job) -> None:
-    """Check the calibration before clouds are made with it: `check_accepted` and
-    `warn_if_stale`."""
-    check_accepted(job.store, job.accept_rejected)
-    warn_if_stale(job.store, job.warn)
 
 
 def accept_rejected_calibration(store: Session, on: bool) -> None:
@@ -469,8 +470,9 @@ def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:
     return {name: load_model(store, name) for name in names or available_models(store)}
 
 
-def warn_if_stale(store: Session, warn: Warn) -> None:
-    """Warn when target poses have changed since the calibration was made."""
+def warn_of_calibration(store: Session, warn: Warn) -> None:
+    """Warn when target poses have changed since the calibration was made, and of an imported one
+    that no capture has checked."""
     names = available_models(store)
     stale = [name for name in names if store.state_of(f"calibration/{name}") == "stale"]
     if stale:
@@ -479,6 +481,8 @@ def warn_if_stale(store: Session, warn: Warn) -> None:
             f"the {' and '.join(stale)} {which} made from target poses that have since been"
             " replaced or removed: run `slviewer calibrate` again"
         )
+    if warning := warning_of_imported(store):
+        warn(warning)
 
 
 def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None:
@@ -489,8 +493,10 @@ def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None
 
 
 def load_last_verdict(store: Session) -> Verdict | None:
-    """Load the verdict on the last attempt to calibrate, also a failed one; None before the
-    first."""
+    """Load the verdict on the last attempt to calibrate, also a failed one, or on an imported
+    calibration; None before the first."""
+    if (verdict := judge_imported(store)) is not None:
+        return verdict
     if not store.has_result(VERDICT):
         return None
     return store.decode_result(

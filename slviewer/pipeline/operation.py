@@ -20,6 +20,7 @@ import numpy as np
 
 from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
 from slviewer.pipeline.cloud_corrections import scale_factor
+from slviewer.pipeline.imported_verdict import warning_of_imported
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.record import Meta, Record, from_plain, render_text, to_plain
@@ -354,10 +355,12 @@ class Operation(Generic[P, S, R]):
         name: str,
         record: type[R],
         settings: Callable[P, S],
+        others: tuple[type[Record], ...],
         function: Callable[[Job, S], Iterator[Found[Any]]],
     ) -> None:
         update_wrapper(self, function)
         self.name, self.function, self.record, self.settings = name, function, record, settings
+        self.others = others
         kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         session = inspect.Parameter("session", kind, annotation=SessionLike)
         self.__signature__ = inspect.Signature(
@@ -388,15 +391,16 @@ class Operation(Generic[P, S, R]):
         A session that another process writes to, or that is open for reading, is left as it is,
         with a warning for the former.
         """
-        records: dict[str, R] = {}
+        records, kind = dict[str, Any](), self.record
         files, notes = list[Path](), list[str]()
         with opened_to_save(session, warn) as store:
             for found in self.find(Job(store, progress, warn), settings):
-                if isinstance(found.record, self.record):
+                if isinstance(found.record, (self.record, *self.others)):
                     records[found.name] = found.record
+                    kind = cast("type[R]", type(found.record))
                 files += found.files
                 notes += found.notes
-        return Findings(self.record, records, tuple(files), tuple(notes))
+        return Findings(kind, records, tuple(files), tuple(notes))
 
     def find(self, job: Job, settings: S) -> Iterator[Found[Any]]:
         """Yield everything that the operation finds, of any kind, once it is stored."""
@@ -414,6 +418,9 @@ class Operation(Generic[P, S, R]):
                     if hasattr(record, "time"):
                         origin["time"] = datetime.now(UTC).isoformat(timespec="seconds")
                     record = msgspec.structs.replace(record, **origin)
+                if any(each.startswith("calibration/") for each in record.inputs):
+                    warning = warning_of_imported(job.store)
+                    record = msgspec.structs.replace(record, calibration_warning=warning)
                 if found.stored and job.store.is_writable:
                     save_record(job.store, name, record, found.arrays)
                 yield replace(found, name=name, record=record)
@@ -436,11 +443,11 @@ OPERATIONS: dict[str, Operation[Any, Any, Any]] = {}
 
 
 def operation(
-    name: str, record: type[R], settings: Callable[P, S]
+    name: str, record: type[R], settings: Callable[P, S], others: tuple[type[Record], ...] = ()
 ) -> Callable[[Callable[[Job, S], Iterator[Found[Any]]]], Operation[P, S, R]]:
     """Return a decorator that makes a function the operation of that name, which finds records with
-    settings."""
-    return partial(Operation, name, record, settings)
+    settings; in some sessions one of a kind of the ``others`` instead."""
+    return partial(Operation, name, record, settings, others)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,10 +24,11 @@ from slviewer.pipeline.cloud_corrections import (
     scale_factor,
 )
 from slviewer.pipeline.cloud_record import cloud_record, masked_share
+from slviewer.pipeline.imported_calibration import check_calibration
+from slviewer.pipeline.imported_verdict import warning_of_imported
 from slviewer.pipeline.models import (
     Model,
     ModelName,
-    check_calibration,
     frame_of,
     lens_warnings,
     load_model,
@@ -549,6 +550,8 @@ def read_merge(store: Session, result: str, warn: Warn, roi: str = "") -> tuple[
         )
     if not is_up_to_date(store, result):
         warn(f"{result} came from scans or a calibration that have changed since: merge again")
+    if warning := warning_of_imported(store):
+        warn(warning)
     merge = load_record(store, Merge, result.removeprefix(f"{Merge.kind}/"))
     return merge, read_ply(store.exports / merge.ply)
 

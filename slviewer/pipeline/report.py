@@ -29,6 +29,7 @@ from slviewer.pipeline.models import (
     load_residuals,
     load_stereo,
     load_stereo_if_complete,
+    load_stereo_verdict,
     preferred_model,
     recommended_model,
 )
@@ -40,7 +41,6 @@ from slviewer.pipeline.operation import (
     ignore_progress,
     list_records,
     load_arrays,
-    load_record,
     match_names,
     name_records,
     opened,
@@ -50,7 +50,6 @@ from slviewer.pipeline.poses import load_observations
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals
 from slviewer.records.acceptance import AcceptanceTest, Drift
-from slviewer.records.calibration import ModelCalibration
 from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
@@ -250,7 +249,7 @@ def _judge(store: Session, figures: CalibrationFigures | None, model: str) -> di
     verdict = load_last_verdict(store)
     if verdict is None or figures is None:
         return {"verdict": verdict, "verdict_of_calibration": False}
-    if verdict != load_record(store, ModelCalibration, "stereo").verdict:
+    if verdict != load_stereo_verdict(store):
         return {"verdict": verdict, "verdict_of_calibration": False}
     return {"verdict": figures.reprojection.judge(verdict, model)}
 

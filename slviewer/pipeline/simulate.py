@@ -11,6 +11,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import compute_ahead
+from slviewer.pipeline.imported_verdict import SIMULATED_TRUTH
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.operation import Progress, ignore_progress
 from slviewer.session.capture import NewCapture
@@ -142,7 +143,7 @@ def save_true_stereo(store: Session, rig: SimulatedRig, **other: np.ndarray) -> 
     save_imported_stereo(
         store,
         {**lenses, "R": rig.R, "T": rig.t, **other},
-        source="the simulation's truth",
+        source=SIMULATED_TRUTH,
         camera=rig.camera.size,
         projector=rig.projector.size,
     )

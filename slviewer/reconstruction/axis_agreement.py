@@ -8,7 +8,7 @@ axis depth is taken from.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -74,6 +74,24 @@ _FLIPS = (
 )
 """Coordinates (x, y) that run backwards, and what that says of the projector's and of the camera's
 image."""
+Direction = Literal["as stated", "inverted", "transposed", "transposed and inverted"]
+REMEDIES: Mapping[Direction, str] = {
+    "inverted": "R and T are inverted: they map the projector to the camera; import their inverse",
+    "transposed": (
+        "R is transposed, as MATLAB writes it for row vectors; import its transpose, and T as it is"
+    ),
+    "transposed and inverted": (
+        "R is transposed, and R and T are inverted; import R as it is, and -R^T T for T"
+    ),
+}
+"""What a file's R and T may be instead of the transform from camera to projector."""
+OTHER_CALIBRATION = (
+    "the calibration does not belong to this capture; import the projector's true size and axes, or"
+    " calibrate this rig"
+)
+OTHER_RIG = (
+    "the calibration is of another rig, or the rig was moved since: calibrate the rig as it stands"
+)
 LEAST_WITHIN = 0.5
 """Share of the points between these depths, below which the depths themselves are doubtful."""
 
@@ -192,12 +210,12 @@ def check_phases(
 
     rig = calibration.pinholes
     if len(phases) < 2:
-        depths, share = _single_axis(phases, rig)
+        depths, share = measure_single_axis(phases, rig)
         if share < LEAST_MEASURED[0]:
             refuse(
                 f"{name}: {100 * (1 - share):.0f} % of the decoded pixels meet no point that the"
-                " calibrated projector could light: the calibration does not belong to this"
-                " capture; import the projector's true size and axes, or calibrate this rig"
+                " calibrated projector could light:"
+                f" {possible_directions(phases, rig) or OTHER_CALIBRATION}"
             )
         elif share < LEAST_MEASURED[1]:
             warnings.append(
@@ -205,14 +223,14 @@ def check_phases(
                 " calibrated projector could light: see that the calibration belongs to this rig"
             )
         return CaptureCheck((*warnings, *_depth_warning(name, depths, depth_range)))
-    pixels, measured, sigma = _samples(phases)
+    pixels, measured, sigma = sample_axes(phases)
     agreement = measure_axis_agreement(calibration, pixels, measured, sigma)
     if agreement is None:
         return CaptureCheck()
     if agreement.is_refused:
         refuse(
             f"{name}: {_describe_contradiction(agreement)}:"
-            f" {_likely_reason(agreement, rig, pixels, measured)}"
+            f" {likely_reason(agreement, rig, pixels, measured)}"
         )
     at = pixels[agreement.known], measured[agreement.known]
     excess, misfit = _map_misfit(calibration, at[0], agreement), None
@@ -286,13 +304,28 @@ def _map_misfit(
     return excess if excess.any() else None
 
 
+def list_directions(rig: StereoRig) -> dict[Direction, StereoRig]:
+    """Return what the rig is if R and T are as stated, inverted, transposed, or both."""
+    R, t = rig.R, rig.t
+    transforms: dict[Direction, tuple[Floats, Floats]] = {
+        "as stated": (R, t),
+        "inverted": (R.T, -R.T @ t),
+        "transposed": (R.T, t),
+        "transposed and inverted": (R, -R.T @ t),
+    }
+    return {
+        direction: StereoRig(rig.camera, rig.projector, *transform)
+        for direction, transform in transforms.items()
+    }
+
+
 def measure_axis_agreement(
     calibration: Calibration, pixels: Floats, measured: Floats, sigma: Floats
 ) -> AxisAgreement | None:
     """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px,
     of noise ``sigma`` (n, 2) px, miss each other; None where fewer than 200 are calibrated."""
     rig = calibration.pinholes
-    agreement = _compute_agreement(
+    agreement = compute_agreement(
         rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px
     )
     return agreement if len(agreement.distance) >= LEAST_PIXELS else None
@@ -328,7 +361,7 @@ def _rays(normalised: Floats) -> Floats:
     return np.column_stack([normalised, np.ones(len(normalised))])
 
 
-def _compute_agreement(
+def compute_agreement(
     rig: StereoRig, camera: Floats, projector: Floats, sigma: Floats, residual_px: float
 ) -> AxisAgreement:
     """Return the axis agreement of undistorted coordinates (n, 2) with noise ``sigma`` (n, 2)
@@ -359,7 +392,7 @@ def _sample_pixels(mask: np.ndarray) -> np.ndarray:
     return places[:, :: max(1, -(-places.shape[1] // SAMPLE))]
 
 
-def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[Floats, Floats, Floats]:
+def sample_axes(phases: Mapping[Axis, PhaseMap]) -> tuple[Floats, Floats, Floats]:
     """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their
     errors (n, 2) px by noise and by blur at edges."""
     v, u = _sample_pixels(np.logical_and.reduce([phase.mask for phase in phases.values()]))
@@ -369,7 +402,7 @@ def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[Floats, Floats, Floats]:
     return np.column_stack([u, v]).astype(float), measured, np.column_stack(errors).astype(float)
 
 
-def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[Floats, float]:
+def measure_single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[Floats, float]:
     """Depths (n,) mm of one axis' points, and the share of the decoded pixels that have one."""
     ((axis, phase),) = phases.items()
     v, u = _sample_pixels(phase.mask)
@@ -380,6 +413,14 @@ def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[Float
     )
     known = np.isfinite(points[:, 2])
     return points[known, 2], float(known.mean())
+
+
+def possible_directions(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> str:
+    """Return in words what R and T may be instead: the directions that put the points of one axis
+    before both devices and into the projector's field; empty without any."""
+    directions = list_directions(rig)
+    shares = {each: measure_single_axis(phases, directions[each])[1] for each in REMEDIES}
+    return "; or ".join(REMEDIES[each] for each, s in shares.items() if s >= LEAST_MEASURED[1])
 
 
 def _depth_warning(
@@ -414,13 +455,13 @@ def _describe_contradiction(agreement: AxisAgreement) -> str:
     return f"by this calibration {share} of the points lie behind the camera or the projector"
 
 
-def _likely_reason(
+def likely_reason(
     agreement: AxisAgreement, rig: StereoRig, pixels: Floats, measured: Floats
 ) -> str:
     """Return in words the hypothesis that explains the frames best."""
     best, reason = np.inf, ""
     for words, other, at, coordinates in _hypotheses(rig, pixels, measured):
-        tried = _compute_agreement(
+        tried = compute_agreement(
             other,
             other.camera.undistort(at),
             other.projector.undistort(coordinates),
@@ -437,10 +478,7 @@ def _likely_reason(
         explained = max(explained, EXPLAINED * agreement.misfit_px)
     if best < explained:
         return f"{reason} (then they disagree by {best:.1f} px)"
-    return (
-        "the calibration is of another rig, or the rig was moved since: calibrate the rig as it"
-        " stands"
-    )
+    return OTHER_RIG
 
 
 def _hypotheses(
@@ -455,19 +493,21 @@ def _hypotheses(
         yield of_projector, rig, pixels, np.where(flip, size - 1 - measured, measured)
         reason = f"the camera's image is {of_camera}; record it as for the calibration"
         yield reason, rig, np.where(flip, image - 1 - pixels, pixels), measured
-    inverse = StereoRig(rig.camera, rig.projector, rig.R.T, -rig.R.T @ rig.t)
-    yield (
-        "R and T are inverted: they map the projector to the camera; import their inverse",
-        inverse,
-        pixels,
-        measured,
-    )
+    directions = list_directions(rig)
+    for direction, remedy in REMEDIES.items():
+        yield remedy, directions[direction], pixels, measured
     camera, projector = (
         Lens(other.K, other.D, own.size)
         for own, other in ((rig.camera, rig.projector), (rig.projector, rig.camera))
     )
     reason = "the matrices of camera and projector are exchanged; import them the other way round"
     yield reason, StereoRig(camera, projector, rig.R, rig.t), pixels, measured
+    inverse = directions["inverted"]
+    reason = (
+        "camera and projector are exchanged, as device 1 and 2 of the file; import the matrices the"
+        " other way round, and the inverse of R and T"
+    )
+    yield reason, StereoRig(camera, projector, inverse.R, inverse.t), pixels, measured
     for factor, times, cure in ((2.0, "twice", "halve"), (0.5, "half", "double")):
         repair = f"{cure} fx, fy, cx and cy"
         reason = f"the camera's matrix is at {times} the pixel scale of the images: {repair}"

@@ -38,10 +38,49 @@ def worst_decision(decisions: Collection[Decision]) -> Decision:
     return next((each for each in ("fail", "undecided") if each in decisions), "pass")
 
 
+LEAST_SURFACE = 0.85
+"""Share of the visible surface that a pass takes: a bar before a ball may cover a tenth of it."""
+MAX_STRAYS = 0.02
+"""Share of the points that a fit may exclude although they depart together by more than a
+limit."""
+
+
+class SurfaceEvidence(msgspec.Struct, frozen=True):
+    """What the figures of a ball or a plane rest on: the share of its visible surface that was
+    ``measured``, and that something before it ``covered``; the share of the measured points that
+    the fit ``excluded``; the lowest and the highest deviation that neighbouring points share."""
+
+    measured: float
+    covered: float
+    excluded: float
+    lowest_mm: float
+    highest_mm: float
+
+    @property
+    def range_mm(self) -> float:
+        """The range of the deviations that neighbouring points share."""
+        return self.highest_mm - self.lowest_mm
+
+    def explain_gap(self, limit_mm: float) -> str:
+        """Return why no pass within a limit follows from this; empty where one may."""
+        if self.measured < LEAST_SURFACE:
+            covered = f", {100 * self.covered:.0f} % is covered" if self.covered >= 0.01 else ""
+            return (
+                f"{100 * self.measured:.0f} % of the visible surface was measured{covered}, and a"
+                f" pass takes {100 * LEAST_SURFACE:.0f} %"
+            )
+        if self.excluded > MAX_STRAYS and self.range_mm > limit_mm:
+            return (
+                f"{100 * self.excluded:.0f} % of the points were excluded, and depart by"
+                f" {self.range_mm:.3f} mm together: this is no whole feature"
+            )
+        return ""
+
+
 class PropertyError(msgspec.Struct, frozen=True):
     """The error of a property at one position, with the test's expanded uncertainty (k = 2), and
     where the error lies with 95 and 99.7 % probability; of form and flatness the ranges that hold
-    as many points."""
+    as many points. ``smallest_mm``: the smallest error that would have been seen."""
 
     property: str
     position: str
@@ -49,6 +88,7 @@ class PropertyError(msgspec.Struct, frozen=True):
     U_mm: float
     within_95_mm: Interval
     within_997_mm: Interval
+    smallest_mm: float | None = None
 
 
 class JudgedProperty(msgspec.Struct, frozen=True):
@@ -65,7 +105,7 @@ class PositionErrors(msgspec.Struct, frozen=True):
     """What was measured at one position: ``rms_mm`` and ``floor_mm`` of each ball or the plane, RMS
     of the points' deviations and what noise alone would leave; ``noise_mm``: standard uncertainty
     of a length by the cloud's noise alone; ``incidence``: percent in R1, R2, R3; ``warnings``: what
-    was excluded."""
+    was excluded; ``evidence`` and ``centres_mm`` of each ball, or the plane."""
 
     position: str
     capture: str
@@ -76,11 +116,29 @@ class PositionErrors(msgspec.Struct, frozen=True):
     noise_mm: float = 0.0
     incidence: dict[str, float] | None = None
     warnings: list[str] = []
+    evidence: list[SurfaceEvidence] = []
+    centres_mm: list[Vector] = []
+
+    def explain_gap(self, limit_mm: float) -> str:
+        """Return why no pass follows from this position; empty where one may."""
+        return next(filter(None, (each.explain_gap(limit_mm) for each in self.evidence)), "")
 
     @property
     def properties(self) -> set[str]:
         """Names of the properties that were measured here."""
         return {figure.property for figure in self.figures}
+
+    def list_evidence(self) -> dict[Any, float | None]:
+        """Return the least share measured, the greatest excluded, and the largest deviation that
+        neighbours share, of all features, by column."""
+        if not self.evidence:
+            return {}
+        return {
+            Column("measured", "%", digits=0): 100 * min(each.measured for each in self.evidence),
+            Column("covered", "%", digits=0): 100 * max(each.covered for each in self.evidence),
+            Column("excluded", "%", digits=1): 100 * max(each.excluded for each in self.evidence),
+            Column("shared deviation", "mm"): max(each.range_mm for each in self.evidence),
+        }
 
     def error(self, name: str) -> PropertyError:
         """Return the worst figure of a property at this position."""
@@ -232,6 +290,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
                 Column("worst", "mm", digits=4): each.worst.error_mm,
                 Column("at", detail=True): each.worst.position,
                 Column("uncertainty U, k = 2", "mm", digits=4): each.worst.U_mm,
+                Column("smallest error seen", "mm", digits=4): each.worst.smallest_mm,
                 **{
                     Column(end, "mm", "95 % lie", digits=4, detail=True): mm
                     for end, mm in zip(("from", "to"), each.worst.within_95_mm, strict=True)
@@ -262,6 +321,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
                 ),
                 **list_shares(each.incidence),
                 Column("points", detail=True): each.points,
+                **each.list_evidence(),
             }
             for each in self.positions
         ]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from math import dist
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -389,6 +389,79 @@ class ModelCalibration(Record, frozen=True, kw_only=True):
         if self.second_camera:
             of_fit = of_fit.rename({"projector": SECOND_CAMERA})
         return replace(of_fit, notes=[*pair, *of_fit.notes, *verdict])
+
+
+Answer = Literal["agrees", "disagrees", "undecided"]
+Compared = Literal["two axes", "board", "sphere", "single axis"]
+
+
+class TransformCheck(Record, frozen=True, kw_only=True):
+    """Whether a capture agrees with R and T of a calibration that was imported.
+
+    ``evidence``: what of the capture was compared. ``misfit``: how far it is from what R and T
+    predict, which is explained up to ``limit``, both in ``unit``; ``others``: the misfit if they
+    were inverted or transposed; None where points would lie behind a device. ``scale``: the length
+    that T should have, of the stated one; None where the capture does not determine it.
+    ``depth_mm``: median of the surface. ``remedy``: what R and T most likely are where the capture
+    contradicts them; else what would check them.
+    """
+
+    kind = "transform"
+    title = "Checks of the imported calibration"
+    is_history = True
+    is_of_captures = False
+    has_figures = False
+    capture: str
+    answer: Answer
+    evidence: Compared
+    misfit: float | None = None
+    limit: float = 0.0
+    unit: Literal["px", "mm"] = "px"
+    remedy: str = ""
+    others: dict[str, float | None] = {}
+    scale: float | None = None
+    depth_mm: float | None = None
+    time: str = ""
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the capture agrees."""
+        return self.answer == "agrees"
+
+    @property
+    def failure(self) -> str:
+        """Why the calibration must not be used."""
+        return self.summary() if self.answer == "disagrees" else ""
+
+    @property
+    def sentence(self) -> str:
+        """The answer and what it rests on."""
+        of = f"R and T of the imported calibration, by its {self.evidence}"
+        if self.answer == "undecided":
+            return f"calibration not checked: {self.capture} does not determine {of}"
+        if self.misfit is None:
+            off = "points lie behind a device"
+        else:
+            off = f"misfit {self.misfit:.2f} {self.unit}, explained up to {self.limit:.2f}"
+        if self.scale is not None:
+            off += f"; T would be {self.scale:.4g} times as long"
+        verb = "agrees with" if self.is_good else "contradicts"
+        return f"{self.capture} {verb} {of} ({off})"
+
+    def summary(self) -> str:
+        """Return the answer, what it rests on, and what to do."""
+        return f"{self.sentence}: {self.remedy}" if self.remedy else self.sentence
+
+    def list_tables(self, name: str) -> list[Table]:
+        """Return the answer, or the misfit of each direction where these were compared."""
+        rows: list[dict[Any, Any]] = [
+            {"capture": self.capture, "compared": self.evidence, "answer": self.answer}
+        ]
+        if self.others:
+            column = Column("misfit", self.unit)
+            tried = {"as stated": self.misfit, **self.others}
+            rows = [{"R and T": direction, column: value} for direction, value in tried.items()]
+        return [Table.of(rows, f"Check {name}", [f"{self.summary()}."])]
 
 
 def _describe_imported(matrices: Mapping[str, Any]) -> dict[str, Any]:

@@ -413,7 +413,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What an operation found: figures with their units in the names, and what they were made from.
 
     ``operation`` and ``settings``, those that are not the default, made it from ``inputs``:
-    {capture or result: its hash}; ``scales``: {model: correction of scale in the figures}. A
+    {capture or result: its hash}; ``scales``: {model: correction of scale in the figures};
+    ``calibration_warning``: why the calibration was doubtful or not checked, if it was. A
     subclass names its ``kind``, the folder of its results, and its ``title``; its docstring
     explains its figures in the report. What older versions stored is converted by `upgrade`.
     ``prefix``: what the names of numbered records begin with; ``labels``: the decision with the
@@ -432,6 +433,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     settings: dict[str, Any] = {}
     inputs: dict[str, str] = {}
     scales: dict[str, float] = {}
+    calibration_warning: str = ""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

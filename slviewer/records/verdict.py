@@ -34,6 +34,7 @@ Cause = Literal[
     "projector-size",
     "unreadable",
     "camera-file",
+    "transform",
     "board-size",
     "board-numbering",
     "moved",

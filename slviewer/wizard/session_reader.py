@@ -28,6 +28,7 @@ from slviewer.pipeline.models import (
     load_model,
     load_reprojection,
     load_stereo_if_complete,
+    load_stereo_verdict,
     preferred_model,
     recommended_model,
     rejection_reason,
@@ -138,7 +139,7 @@ class SessionReader:
         records = tuple(self._read_records())
         labels = session.valid_decision("names") or {}
         verdict = self._attempt("the verdict", load_last_verdict, session)
-        judged = calibration and load_record(session, ModelCalibration, "stereo").verdict
+        judged = calibration and load_stereo_verdict(session)
         return SessionView(
             folder=session.folder,
             target=target,

@@ -1,9 +1,11 @@
 """Acceptance tests on a simulated rig whose calibration is the truth, or wrong by a known scale."""
 
 import tomllib
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -33,7 +35,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
-from slviewer.records.acceptance import Contribution, ErrorBudget
+from slviewer.records.acceptance import Contribution, ErrorBudget, SurfaceEvidence
 from slviewer.records.record import render_text
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
@@ -70,8 +72,8 @@ RIG = true_model().rig
 SEQUENCE = one_axis(p18(SIMULATED.projector.size), "x")
 
 
-def phases_of(scene, seed):
-    return {"x": decode(SEQUENCE, Renderer(SIMULATED, scene).capture(SEQUENCE, seed), "x")}
+def phases_of(scene, seed, rig=SIMULATED):
+    return {"x": decode(SEQUENCE, Renderer(rig, scene).capture(SEQUENCE, seed), "x")}
 
 
 def bar(T: np.ndarray, spacing: float = 100.0) -> Spheres:
@@ -261,3 +263,29 @@ def test_a_budget_adds_squares_and_names_what_is_unknown():
     )
     assert found.U_mm == pytest.approx(0.010) and found.unknown == ["drift"]
     assert missing_facts(render_text(found.table()), "excludes", *found.unknown) == []
+
+
+@pytest.mark.slow
+@pytest.mark.computes
+@pytest.mark.parametrize("turn", [(0.0, 0.004, 0.0), (0.0, -0.006, 0.0)])
+def test_a_projector_that_was_turned_does_not_pass(turn):
+    R = cv2.Rodrigues(np.array(turn))[0]
+    moved = replace(SIMULATED, R=R @ SIMULATED.R, t=R @ SIMULATED.t)
+    bars = [
+        (p.words, phases_of(bar(p.T_camera_artefact), i, moved))
+        for i, p in enumerate(places_of_the_bar()[:3])
+    ]
+    limits = {"spacing_mm": 0.1, "size_mm": 0.1, "form_mm": 0.3}
+    test = outcome(Artefact.from_dict({**GIVEN, "limits": limits}), bars, true_model())
+    assert test.decision == "fail", test.judgements
+
+
+def test_what_was_left_out_is_stated():
+    whole = SurfaceEvidence(
+        measured=0.97, covered=0.0, excluded=0.001, lowest_mm=-0.01, highest_mm=0.01
+    )
+    half = msgspec.structs.replace(whole, measured=0.62, covered=0.2)
+    bent = msgspec.structs.replace(whole, excluded=0.08, lowest_mm=-0.7)
+    assert whole.explain_gap(0.1) == "" and bent.explain_gap(1.0) == ""
+    assert not missing_facts(half.explain_gap(0.1), "62 %", "20 %", "covered", "85 %")
+    assert not missing_facts(bent.explain_gap(0.1), "8 %", "0.710 mm", "excluded")

@@ -16,8 +16,11 @@ from slviewer.fringe.presets import complementary, p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.accept import REFERENCE, accept, check, load_drift_history
 from slviewer.pipeline.cloud_corrections import scale_factor
+from slviewer.pipeline.imported_verdict import judge_imported, list_transform_checks
 from slviewer.pipeline.models import load_stereo
+from slviewer.pipeline.operation import next_name, save_record
 from slviewer.pipeline.simulate import save_true_stereo
+from slviewer.records.calibration import TransformCheck
 from slviewer.session.store import Session
 from slviewer.simulation.boards import printed_board
 from slviewer.simulation.plans import rotation, target_poses
@@ -197,10 +200,62 @@ def test_check_answers_and_remembers(calibrated: Path) -> None:
         assert store.state_of(REFERENCE) == "fresh"
 
 
-def test_a_calibration_from_elsewhere_has_no_floor(bare):
-    sequence = one_axis(p18((912, 1140)), "x")
+def test_check_of_an_imported_calibration_by_one_axis_names_what_it_takes(measured):
+    found = check(measured, "bar_0").only
+    assert found.answer == "undecided" and not found.is_good
+    assert not missing_facts(found.remedy, "both axes", "--target", "--radius")
+    with Session.open(measured) as store:
+        assert list_transform_checks(store)[-1] == found
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        ({}, ()),
+        ({"T": 0.1}, ("cm", "--unit")),
+        pytest.param({"T": 1 / 25.4}, ("inch",), marks=pytest.mark.slow),
+        ({"inverted": 1.0}, ("R", "T", "inverted")),
+    ],
+)
+def test_a_board_along_one_axis_checks_an_imported_calibration(tmp_path, changes, facts):
+    rig = letter(0.25, seed=3, local_distortion_px=0)
+    R, t = (rig.R.T, -rig.R.T @ rig.t) if "inverted" in changes else (rig.R, rig.t)
+    sequence = one_axis(p18(rig.projector.size), "x")
+    with Session.create(tmp_path / "session") as store:
+        save_true_stereo(store, rig, R=R, T=t * changes.get("T", 1.0))
+        meta = store.load_meta("calibration/stereo")
+        given = {key: meta[key] for key in ("imported", "camera", "projector", "inputs")}
+        store.save_result("calibration/stereo", {**given, "source": "rig.yml"}, {})
+        renderer = Renderer(rig, printed_board(BOARD, target_poses(rig, BOARD, 1)[0], seed=3))
+        frames = renderer.capture(sequence, 1)
+        store.save_capture("board", "scan", sequence, frames, source="simulated")
+        save_sound_checks(store)
+        found = check(store, "board", target="circles:21x16:9").only
+        level = judge_imported(store).level
+    assert found.answer == ("disagrees" if facts else "agrees"), found.summary()
+    assert level == ("rejected" if facts else "good") and not missing_facts(found.remedy, *facts)
+    assert found.scale == pytest.approx(1 / changes.get("T", 1.0), rel=0.01) or "inverted" in facts
+
+
+def test_the_last_check_that_knows_a_length_decides(bare):
     with Session.open(bare, write=True) as store:
-        dark = np.zeros((len(sequence.frames), 4, 6), np.uint8)
-        store.save_capture("bar_0", "scan", sequence, dark, source="simulated")
-    with raises(InputError, "elsewhere"):
-        check(bare, "bar_0")
+        meta = store.load_meta("calibration/stereo")
+        given = {key: meta[key] for key in ("imported", "camera", "projector", "inputs")}
+        store.save_result("calibration/stereo", {**given, "source": "rig.yml"}, {})
+        inputs = store.input_hashes("calibration/stereo")
+
+        def level(answer: str, evidence: str, scale: float | None) -> str:
+            found = TransformCheck(
+                capture="a", answer=answer, evidence=evidence, scale=scale, inputs=inputs,
+                depth_mm=600.0,
+            )  # fmt: skip
+            save_record(store, next_name(store, TransformCheck), found, {})
+            return judge_imported(store).level
+
+        assert judge_imported(store).level == "doubtful"
+        assert level("undecided", "single axis", None) == "doubtful"
+        assert level("disagrees", "two axes", None) == "rejected"
+        assert level("agrees", "two axes", None) == "good"
+        assert level("disagrees", "board", 10.0) == "rejected"
+        assert level("agrees", "two axes", None) == "rejected"
+        assert level("agrees", "sphere", 1.0) == "good"

@@ -7,12 +7,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from facts import missing_facts
+from facts import missing_facts, raises
 from sound_checks import save_sound_checks
 
+from slviewer.errors import InputError
 from slviewer.fringe.presets import multifrequency
+from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.import_captures import import_opencv_calibration
+from slviewer.pipeline.imported_verdict import judge_imported
+from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.session.exporters import write_calibration
 from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.importers.opencv_calibration import read_matrices
@@ -47,8 +52,8 @@ def scaled(K: np.ndarray, factor: float) -> np.ndarray:
     return np.diag([factor, factor, 1.0]) @ K
 
 
-def save_wall(session: Path) -> None:
-    """A capture of a slanted wall along both axes, noise of one grey level."""
+def save_wall(session: Path, name: str = "wall", axis: str = "") -> None:
+    """A capture of a slanted wall along both axes, or along one, noise of one grey level."""
     u, v = np.meshgrid(np.arange(CAMERA[0], dtype=float), np.arange(CAMERA[1], dtype=float))
     rays = np.column_stack(
         [RIG.camera.undistort(np.column_stack([u.ravel(), v.ravel()])), np.ones(u.size)]
@@ -56,6 +61,7 @@ def save_wall(session: Path) -> None:
     depth = 600 / (1 + 0.3 * rays[:, 0] + 0.2 * rays[:, 1])
     seen = RIG.project(rays * depth[:, None])
     sequence, rng = multifrequency(PROJECTOR, steps=4), np.random.default_rng(5)
+    sequence = one_axis(sequence, axis) if axis else sequence
     frames = [
         (
             110
@@ -73,7 +79,7 @@ def save_wall(session: Path) -> None:
     stack = np.array(frames).reshape(-1, *u.shape) + rng.normal(0, 1, (len(frames), *u.shape))
     with Session.open_or_create(session) as store:
         store.save_capture(
-            "wall", "scan", sequence, stack.round().astype(np.uint8), source="simulated"
+            name, "scan", sequence, stack.round().astype(np.uint8), source="simulated"
         )
         save_sound_checks(store)
 
@@ -180,7 +186,7 @@ def test_a_capture_that_arrives_later_contradicts_a_calibration(run: Run, tmp_pa
     assert run("import", "opencv-calibration", path, session, *sizes)[0] == 0
     save_wall(session)
     status, _, err = run("reconstruct", session, "wall")
-    assert status == 1 and not missing_facts(err, "wall", "R", "T", "inverted"), err
+    assert status == 3 and not missing_facts(err, "wall", "R", "T", "inverted"), err
 
 
 @pytest.mark.slow
@@ -231,3 +237,42 @@ def test_inspect_describes_a_session_with_an_imported_calibration_alone(
     line = next(line for line in out.splitlines() if "wall" in line)
     assert not missing_facts(line, "camera 160x120", "projector 456x570", "axes x and y")
     assert not missing_facts(line, "25 frames", "x period 16 px")
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_an_imported_calibration_is_not_checked_until_both_axes_agree(
+    tmp_path: Path, axis: str
+) -> None:
+    session, path, warnings = tmp_path / "s", file(tmp_path, entries()), list[str]()
+    save_wall(session, "single", axis)
+    import_opencv_calibration(path, session, warn=warnings.append)
+    settings = reconstruct.settings("single")
+    found = reconstruct.run(session, settings, warn=warnings.append).only
+    assert len([each for each in warnings if "not checked" in each]) == 2, warnings
+    assert not missing_facts(found.calibration_warning, "not checked", "rig.yml", "check")
+    save_wall(session, "both")
+    warnings.clear()
+    assert reconstruct.run(session, settings, warn=warnings.append).only.calibration_warning == ""
+    assert warnings == []
+    with Session.open(session) as store:
+        verdict = judge_imported(store)
+        assert verdict is not None and verdict.level == "good"
+
+
+@pytest.mark.parametrize(("unit", "length"), [("cm", 10.0), ("inch", 25.4)])
+def test_another_unit_stays_doubtful_unless_it_is_stated(
+    session: Path, tmp_path: Path, unit: str, length: float
+) -> None:
+    path, warnings = file(tmp_path, entries(T=RIG.t / length)), list[str]()
+    import_opencv_calibration(path, session, warn=warnings.append)
+    assert [each for each in warnings if "unit not checked" in each and "--unit" in each], warnings
+    warnings.clear()
+    import_opencv_calibration(path, session, unit=unit, force=True, warn=warnings.append)
+    assert warnings == []
+
+
+def test_transposed_is_named_by_one_axis(tmp_path: Path) -> None:
+    session = tmp_path / "s"
+    save_wall(session, "single", "x")
+    with raises(InputError, "single", "transposed", "MATLAB"):
+        import_opencv_calibration(file(tmp_path, entries(R=RIG.R.T)), session)

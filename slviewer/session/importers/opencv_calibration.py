@@ -9,6 +9,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import LARGEST_BASELINE_MM
 from slviewer.geometry.rigid import nearest_rotation
+from slviewer.session.importers import matlab_calibration
 from slviewer.session.importers.filestorage import Storage
 
 ENTRIES = ("K_camera", "D_camera", "K_projector", "D_projector", "R", "T")
@@ -47,14 +48,16 @@ _SIZES = {
 """Where a file may state sizes, width before height."""
 
 
-def read_matrices(storage: Storage, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+def read_matrices(
+    storage: Storage, keys: Sequence[str] | None = None, unit_mm: float = 1.0
+) -> dict[str, np.ndarray]:
     """The matrices under the file's own `keys`, given in the order of `ENTRIES`, and named by
     these.
 
     K (3, 3) px; D (5,) = (k1, k2, p1, p2, k3); R (3, 3), the nearest rotation to what the file
-    says; T (3,) mm; all float64. R and T map camera to projector. Without `keys`, those of
-    `identify_keys`. Raises InputError where an entry is missing, has another shape, or says what
-    pinhole and Brown distortion with square axes cannot.
+    says; T (3,) mm, of the file's `unit_mm`; all float64. R and T map camera to projector. Without
+    `keys`, those of `identify_keys`; MATLAB's are converted. Raises InputError where an entry is
+    missing, has another shape, or says what pinhole and Brown distortion with square axes cannot.
     """
     keys = identify_keys(storage) if keys is None else keys
     if len(keys) != len(ENTRIES):
@@ -69,6 +72,9 @@ def read_matrices(storage: Storage, keys: Sequence[str] | None = None) -> dict[s
     if matrices["R"].shape == (3, 4) and {"R1", "R2"} <= set(storage.entries):
         # SLMaster writes P2 in its place; both rectifying rotations contain it
         matrices["R"] = storage.matrix("R2").T @ storage.matrix("R1")
+    named = dict(zip(ENTRIES, keys, strict=True))
+    matrices = matlab_calibration.convert_entries(storage, named, matrices)
+    matrices["T"] = unit_mm * matrices["T"]
     return {
         entry: _CHECKS[entry[0]](matrices[entry], f"{storage.name}: {key}")
         for entry, key in zip(ENTRIES, keys, strict=True)
@@ -81,7 +87,8 @@ def identify_keys(storage: Storage) -> tuple[str, ...]:
     Raises InputError where they are none of these, or where several would do.
     """
     rows = [(*lenses, *transform) for lenses in _INTRINSICS for transform in _TRANSFORMS]
-    matches = [row for row in rows if set(row) <= set(storage.entries)]
+    matches: list[tuple[str, ...]] = [row for row in rows if set(row) <= set(storage.entries)]
+    matches += matlab_calibration.list_keys(storage)
     if len(matches) == 1:
         return matches[0]
     remedy = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {_list_keys(storage)}"
@@ -105,7 +112,7 @@ def read_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
             if values.shape == (2,) and (values >= 1).all() and (values == values.round()).all():
                 sizes[device] = (int(values[0]), int(values[1])), " and ".join(keys)
                 break
-    return sizes
+    return sizes or matlab_calibration.read_image_sizes(storage)
 
 
 def _list_keys(storage: Storage) -> str:
@@ -165,7 +172,10 @@ def _check_translation(matrix: np.ndarray, where: str) -> np.ndarray:
     translation: np.ndarray = matrix.ravel()
     length = math.hypot(*translation)
     if not _SHORTEST_BASELINE_MM <= length <= LARGEST_BASELINE_MM:
-        raise InputError(f"{where} is {length:.3g} long: give the translation in mm")
+        raise InputError(
+            f"{where} is {length:.3g} mm long: give its unit with --unit (mm, cm, m, inch), or"
+            " the translation in mm"
+        )
     return translation
 
 
