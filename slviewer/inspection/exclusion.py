@@ -38,7 +38,7 @@ BURR = 0.1
 """Of the nominal's diagonal: what touches the part beside its footprint and reaches less far from
 it is the part's own, a burr or dirt; what reaches farther may be a clamp."""
 STANDING = 0.9
-"""Share of what touches the part that lies over the touched face, if it is a feature of the part."""
+"""Share of what touches the part that lies over the touched face, where it is a feature."""
 CONTACT = 0.5
 """Of the spacing that most neighbours of a scan keep threefold: what is nearer touches."""
 MAX_CONTACT_POINTS = 200_000

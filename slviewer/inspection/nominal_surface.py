@@ -310,9 +310,9 @@ def search_pose(
 
     A scan that ``has_camera`` shows one side of a part: poses are searched on what a camera sees of
     the nominal from each of the ``views`` (on all of it first without), and fitted to all of it,
-    until one fits well; else the one of least cost is taken. Among the poses of a symmetric part the
-    choice does not change the deviations. Raises ``Refused`` where the best does not fit, or the
-    shape does not hold it.
+    until one fits well; else the one of least cost is taken. Among the poses of a symmetric part
+    the choice does not change the deviations. Raises ``Refused`` where the best does not fit, or
+    the shape does not hold it.
     """
     points = subsample(points, MAX_POINTS)
     normals = None if normals is None else subsample(normals, MAX_POINTS)

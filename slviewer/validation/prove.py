@@ -6,6 +6,7 @@ from typing import Any, Literal, get_args
 
 from slviewer.pipeline.operation import Progress, ignore_progress, part
 from slviewer.validation.proof import Proof
+from slviewer.validation.prove_acceptance import prove_acceptance
 from slviewer.validation.prove_accuracy import prove_accuracy, prove_uncertainty
 from slviewer.validation.prove_cameras import prove_cameras
 from slviewer.validation.prove_captures import prove_captures
@@ -14,6 +15,7 @@ from slviewer.validation.prove_guidance import prove_guidance
 from slviewer.validation.prove_hostile import prove_hostile
 from slviewer.validation.prove_parts import prove_parts
 from slviewer.validation.prove_plan import prove_plan
+from slviewer.validation.prove_plan_faults import prove_plan_faults
 from slviewer.validation.prove_registration import prove_registration
 from slviewer.validation.prove_reports import prove_reports
 from slviewer.validation.prove_surfaces import prove_edges, prove_surfaces
@@ -48,6 +50,28 @@ def prove_named_faults(scale: float, *, seed: int, progress: Progress) -> Proof:
     )
 
 
+def prove_verdicts(scale: float, *, seed: int, progress: Progress) -> Proof:
+    """Verdicts on parts against their models, by inspection plans, and of acceptance tests."""
+    parts = prove_parts(scale, seed=seed, progress=part(progress, 0, 0.6))
+    plans = prove_plan_faults(scale, seed=seed, progress=part(progress, 0.6, 0.85))
+    acceptance = prove_acceptance(scale, seed=seed, progress=part(progress, 0.85, 1))
+    return Proof(
+        parts.holds and plans.holds and acceptance.holds,
+        scale,
+        acceptance.rows,
+        {
+            "parts": parts.to_json(),
+            "plans": plans.to_json(),
+            "acceptance": acceptance.to_json(),
+        },
+        [
+            *(parts.text(), "", "inspection plans", "", plans.text(), ""),
+            *("acceptance tests", "", *acceptance.above),
+        ],
+        acceptance.below,
+    )
+
+
 CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "accuracy": ("accuracy at the noise floor", prove_accuracy),
     "cameras": ("two cameras", prove_cameras),
@@ -55,7 +79,7 @@ CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "edges": ("printed edges without ridges", prove_edges),
     "guidance": ("guided poses", prove_guidance),
     "hostile": ("captures of a hostile rig", prove_hostile),
-    "parts": ("verdicts on parts", prove_parts),
+    "parts": ("verdicts on parts", prove_verdicts),
     "plan": ("tolerances of an inspection plan", prove_plan),
     "registration": ("scans in one frame", prove_registration),
     "reports": ("reported situations", prove_reports),
