@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from slviewer.errors import InputError
 from slviewer.evaluation.fit import evaluate_spheres, finite_or_none
@@ -111,6 +110,8 @@ def check_by_board(name: str, rig: StereoRig, points: Floats, measured: Floats) 
     """Check R and T, and the length of T, by a board's features (n, 3) mm in the camera's frame and
     their projector coordinates (n, 2) px, a column of NaN for an axis without patterns. The misfit
     is the distance from the projected features, px."""
+    from scipy.optimize import minimize_scalar  # half a second that few checks need
+
     known, fits = np.isfinite(measured), dict[Direction, Fit]()
     for direction, other in _list_distinct(rig, points).items():
 

@@ -16,7 +16,13 @@ from slviewer.geometry.rigid import (
 )
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import lengths, rms, subsample, unit_vectors
-from slviewer.inspection.exclusion import NOISE, ClassifiedPoints, LocatedPoints, classify_points
+from slviewer.inspection.exclusion import (
+    NOISE,
+    ClassifiedPoints,
+    LocatedPoints,
+    classify_points,
+    find_tables,
+)
 from slviewer.inspection.nominal_surface import (
     GOOD_ERROR,
     REACH,
@@ -175,13 +181,13 @@ def deviation(
 ) -> Deviation:
     """Align scan points (n, 3) mm with a nominal model, and return the signed distance of each.
 
-    ``normals`` (n, 3) of the scan, towards the camera, NaN where unknown: what faces another way
-    than the nominal is excluded by them. ``sigma_mm``: the expected error of one point.
-    ``reach_mm``: points farther off the nominal belong to something else; by default 2 % of its
-    diagonal, never below ten times the noise. ``initial`` (4, 4) scan to nominal: replaces the
-    search. ``views``: of each view the centres (k, 3) mm of its devices, in the scan's frame, which
-    all have to see a place; all places are visible without, and None is for a scan that no camera
-    at its origin saw. Raises SlviewerError where the two cannot be aligned with trust.
+    ``normals`` (n, 3) of the scan, towards the camera, NaN where unknown: by them the sides of a
+    wall are told apart. ``sigma_mm``: the expected error of one point. ``reach_mm``: points farther
+    off the nominal do not count in the best fit, and are deviations unless they stand beside the
+    part; by default 2 % of its diagonal, never below ten times the noise. ``initial`` (4, 4) scan
+    to nominal: replaces the search. ``views``: of each view the centres (k, 3) mm of its devices,
+    in the scan's frame, which all have to see a place; all places are visible without, and None is
+    for a scan that no camera at its origin saw. Raises SlviewerError where the two cannot be aligned with trust.
     """
     report = progress or (lambda share: None)
     points = np.asarray(points, np.float64)
@@ -197,17 +203,11 @@ def deviation(
     report(0.0)
     T = initial
     if T is None:
-        has_camera = views is not None
-        try:
-            T = search_pose(
-                points, normals, surface, sigma_mm, lambda share: report(0.6 * share), has_camera
-            )
-        except Refused as refusal:
-            near = max(GOOD_ERROR * surface.diagonal, NOISE * (sigma_mm or 0.0))
-            other = explain_misfit(points, normals, nominal, None, near, has_camera)
-            if other:
-                raise WrongPart(f"The scan does not show the nominal model: {other}.") from refusal
-            raise
+        shown = find_tables(points, surface, sigma_mm or 0.0)
+        facing = None if normals is None else normals[~shown]
+        T = _search_pose(
+            points[~shown], facing, surface, sigma_mm, views, lambda x: report(0.6 * x)
+        )
     turned = np.zeros(len(nominal.faces), bool)
     if normals is not None:
         turned = surface.seen_from_behind(points, normals, T, reach_mm)
@@ -247,6 +247,27 @@ def deviation(
         scan.normals,
         int(turned.sum()),
     )
+
+
+def _search_pose(
+    points: Floats,
+    normals: Floats | None,
+    surface: NominalSurface,
+    sigma_mm: float | None,
+    views: Sequence[Floats] | None,
+    report: Progress,
+) -> Floats:
+    """The pose (4, 4) of a scan on the nominal. Raises ``WrongPart`` where there is none, and the
+    scan fits another model, else ``Refused``."""
+    has_camera = views is not None
+    try:
+        return search_pose(points, normals, surface, sigma_mm, report, has_camera)
+    except Refused as refusal:
+        near = max(GOOD_ERROR * surface.diagonal, NOISE * (sigma_mm or 0.0))
+        other = explain_misfit(points, normals, surface.mesh, None, near, has_camera)
+        if other:
+            raise WrongPart(f"The scan does not show the nominal model: {other}.") from refusal
+        raise
 
 
 def _locate(

@@ -31,6 +31,9 @@ MIN_TABLE = 50
 TABLE_SHARE = 0.2
 """Points of a plane that the part stands on, and its least share of those beside the part."""
 MAX_PLANES = 3
+TABLE_TOLERANCE, LARGER, MOST_TABLE = 0.002, 1.2, 0.97
+"""Thickness of a plane over the nominal's diagonal; its size over that, from which on it cannot be
+the part; and the largest share of a scan that is a table."""
 FOOTPRINT_SHARE = 0.5
 """Share of a cluster's points over the footprint, or inside the nominal, that makes it a deviation
 of the part."""
@@ -41,7 +44,7 @@ STANDING = 0.9
 """Share of what touches the part that lies over the touched face, where it is a feature."""
 CONTACT = 0.5
 """Of the spacing that most neighbours of a scan keep threefold: what is nearer touches."""
-MAX_CONTACT_POINTS = 200_000
+MAX_CONTACT_POINTS, MAX_TRIED_POINTS = 200_000, 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,20 +127,11 @@ def classify_points(
         cluster = rest[members]
         if len(cluster) < MIN_CLUSTER:
             alone.append(cluster)
-            continue
-        if is_over[members].mean() >= FOOTPRINT_SHARE:
-            continue
-        places = scan.points[cluster]
-        is_attached = part is not None and bool(
-            (part.query(subsample(places, 20_000))[0] <= CONTACT * scan.spacing_mm).any()
-        )
-        if is_attached and (
-            np.abs(signed[cluster]).max() < BURR * surface.diagonal
-            or _stands_on(scan, cluster, signed, surface)
-        ):
-            continue
-        foreign.append(cluster)
-        excluded.append(_describe("touching" if is_attached else "beside", places))
+        elif is_over[members].mean() < FOOTPRINT_SHARE:
+            reason = _reason_to_exclude(scan, cluster, signed, surface, part)
+            if reason is not None:
+                foreign.append(cluster)
+                excluded.append(_describe(reason, scan.points[cluster]))
     if alone:
         excluded.append(_describe("alone", scan.points[np.concatenate(alone)]))
     if foreign:
@@ -147,6 +141,22 @@ def classify_points(
         signed[border] = np.nan
     signed[np.concatenate([*alone, *foreign, far[:0]])] = np.nan
     return ClassifiedPoints(signed, ~is_near & np.isfinite(signed), tuple(excluded))
+
+
+def _reason_to_exclude(
+    scan: LocatedPoints,
+    cluster: np.ndarray,
+    signed: Floats,
+    surface: NominalSurface,
+    part: cKDTree | None,
+) -> Exclusion | None:
+    """Return why a ``cluster`` (k,) beside the footprint is not the part, whose points on the
+    nominal are in the tree ``part``; None where it is a deviation."""
+    places = subsample(scan.points[cluster], MAX_TRIED_POINTS)
+    if part is None or not (part.query(places)[0] <= CONTACT * scan.spacing_mm).any():
+        return "beside"
+    is_low = np.abs(signed[cluster]).max() < BURR * surface.diagonal
+    return None if is_low or _stands_on(scan, cluster, signed, surface) else "touching"
 
 
 def label_clusters(points: Floats, link: float) -> Iterator[np.ndarray]:
@@ -227,6 +237,27 @@ def _list_tables(points: Floats, surface: NominalSurface, scan: LocatedPoints) -
             return
         yield plane
         points = points[~on_plane]
+
+
+def find_tables(points: Floats, surface: NominalSurface, sigma_mm: float) -> Mask:
+    """Return which points (n, 3) of a scan, anywhere, lie on planes that are too large for the
+    part: (n,) bool."""
+    on_table = np.zeros(len(points), bool)
+    tolerance = max(NOISE * sigma_mm, TABLE_TOLERANCE * surface.diagonal)
+    for _ in range(MAX_PLANES):
+        some = subsample(points[~on_table], MAX_TRIED_POINTS)
+        low, high = np.percentile(some, [1, 99], axis=0)
+        if np.linalg.norm(high - low) < LARGER * surface.diagonal:
+            break
+        try:
+            plane, inliers = ransac_plane(some, tolerance)
+        except InputError:
+            break
+        low, high = np.percentile(some[inliers], [2, 98], axis=0)
+        if np.linalg.norm(high - low) < LARGER * surface.diagonal:
+            break
+        on_table |= np.abs(plane.distance(points)) <= tolerance
+    return on_table if on_table.mean() < MOST_TABLE else np.zeros(len(points), bool)
 
 
 def _list_border(scan: LocatedPoints, is_near: Mask, foreign: np.ndarray) -> np.ndarray:

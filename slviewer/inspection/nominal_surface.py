@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import product
+from itertools import permutations, product
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,7 @@ NEGLIGIBLE = 1e-4
 MIN_NORMAL_COSINE = 0.5
 """Cosine: a scan point whose normal is turned away further from the nominal's lies on something
 else there."""
+SNAPPING_COSINE = 0.95
 CHUNK = 32_768
 MAX_VOTERS = 200_000
 LEAST_VOTES = 20
@@ -80,7 +81,7 @@ class NominalSurface:
         self._at_rim = np.zeros(len(vertices), bool)
         self._at_rim[half[first[triangles == 1]]] = True
         self.is_closed = not (triangles == 1).any()
-        self.vertices = vertices
+        self.mesh, self.vertices = mesh, vertices
         self._scene = raycasting_scene(vertices - self.middle, mesh.faces)
 
     def gaps(self, points: Floats) -> Floats:
@@ -93,6 +94,15 @@ class NominalSurface:
         """Return which rays (n, 3), (n, 3) meet the surface: (n,) bool."""
         rays = np.concatenate([origins - self.middle, directions], axis=1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy(), bool)
+
+    def main_axes(self) -> tuple[Floats, Floats]:
+        """Return the model's main axes, the columns of (3, 3), those of its frame where they are
+        near; and the middle (3,) mm of the box along them."""
+        axes = np.linalg.svd(self.sample(5_000)[0] - self.middle, full_matrices=False)[2].T
+        if np.abs(axes).max(axis=0).min() > SNAPPING_COSINE:
+            axes = np.eye(3)
+        axes = np.asarray(axes * np.sign(np.linalg.det(axes)))
+        return axes, axes @ box_middle(self.vertices @ axes)
 
     def is_between(self, starts: Floats, ends: Floats) -> Mask:
         """Return whether the surface lies between places (n, 3), (n, 3), but not at them: (n,)
@@ -222,6 +232,16 @@ VIEWS = [
 ]
 """From where a model is looked at: its sides, from below and above first, then its edges, then its
 corners."""
+TURN_ROUNDS, SCREENED_POINTS, RIVAL_SHARE = 3, 600, (0.4, 0.75)
+"""Points of a scan that turned poses are tried on, and the share of those on the model that must
+lie on it then, too; the first where the pose is not good."""
+RIGHT_TURNS = [
+    sign[:, None] * np.eye(3)[list(order)]
+    for order in permutations(range(3))
+    for sign in map(np.array, product((-1.0, 1.0), repeat=3))
+    if np.linalg.det(sign[:, None] * np.eye(3)[list(order)]) > 0
+][1:]
+"""The rotations (3, 3) of a cube but for none."""
 MIN_FACING_COSINE = 0.1
 AWAY = 3.0
 """Diagonals: from so far."""
@@ -324,17 +344,17 @@ def search_pose(
     for side, camera in _list_sides(surface, has_camera, views, report):
         starts = search_starts(scan, side, min(scan.size, side.size))
         score, in_vain = max(score, starts[0].score), in_vain + 1
-        for start in starts:
-            if start.score < LEAST_SCORE:
-                break
-            T = rigid_transform(np.eye(3), camera) @ start.T
-            with suppress(InputError):  # hardly any of it lies there
-                pose = _fit_start(few, few_normals, surface, T, sigma_mm)
-                if best is None or pose.cost < best.cost:
-                    in_vain = 0 if best is None or pose.cost < BETTER_COST * best.cost else in_vain
-                    best = pose
-        patience = PATIENCE if has_camera else 2
-        if best is not None and (best.is_good or (best.is_likely and in_vain >= patience)):
+        poses = [
+            rigid_transform(np.eye(3), camera) @ start.T
+            for start in starts
+            if start.score >= LEAST_SCORE
+        ]
+        before, best = best, _choose_pose(few, few_normals, surface, sigma_mm, poses, best)
+        if best is None:
+            continue
+        if before is None or best.cost < BETTER_COST * before.cost:
+            in_vain = 0
+        if best.is_good or (best.is_likely and in_vain >= (PATIENCE if has_camera else 2)):
             break
     if best is None:
         raise Refused(
@@ -342,6 +362,12 @@ def search_pose(
             f"{NOT_ALIGNED}: at most {100 * score:.0f} % of it lies on a side of the model, in any"
             " of its poses.",
         )
+    for _ in range(TURN_ROUNDS):
+        before = best
+        turned = _list_right_turns(few, few_normals, surface, best)
+        best = _choose_pose(few, few_normals, surface, sigma_mm, turned, best) or best
+        if best is before or best.is_good:
+            break
     _refuse_if_doubtful(best)
     T, shape = _settle(few, few_normals, surface, best, MOST_SLACK * scan.size)
     if shape is not None:
@@ -352,6 +378,43 @@ def search_pose(
             " part too, or merge scans of several sides.",
         )
     return T
+
+
+def _choose_pose(
+    points: Floats,
+    normals: Floats | None,
+    surface: NominalSurface,
+    sigma_mm: float | None,
+    starts: Sequence[Floats],
+    best: NominalPose | None,
+) -> NominalPose | None:
+    """Return the pose of least cost, ``best`` or one fitted from ``starts`` (4, 4)."""
+    for T in starts:
+        with suppress(InputError):  # hardly any of it lies there
+            pose = _fit_start(points, normals, surface, T, sigma_mm)
+            if best is None or pose.cost < best.cost:
+                best = pose
+    return best
+
+
+def _list_right_turns(
+    points: Floats, normals: Floats | None, surface: NominalSurface, pose: NominalPose
+) -> list[Floats]:
+    """Return poses (4, 4) turned by right angles about the model's main axes that fit nearly as
+    well as ``pose``: a plate fits in four ways, but for its small features."""
+    some = subsample(points, SCREENED_POINTS)
+    own = None if normals is None else subsample(normals, SCREENED_POINTS)
+    reach = REACH * surface.diagonal
+
+    def share_on(T: Floats) -> float:
+        """Share of the scan on the model at a pose."""
+        return float(np.isfinite(surface.distances(some, own, T, 2 * reach)[0]).mean())
+
+    axes, middle = surface.main_axes()
+    least = RIVAL_SHARE[pose.is_good] * share_on(pose.T)
+    turns = [axes @ turn @ axes.T for turn in RIGHT_TURNS]
+    moved = [rigid_transform(R, middle - R @ middle) @ pose.T for R in turns]
+    return [T for T in moved if share_on(T) >= least]
 
 
 def _list_sides(
