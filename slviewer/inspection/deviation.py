@@ -2,6 +2,7 @@
 colours; and what of the nominal was measured, and what of it is missing."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,7 @@ from slviewer.inspection.nominal_surface import (
     REACH,
     NominalSurface,
     fit_pose,
+    improve_pose,
     search_pose,
 )
 from slviewer.inspection.uncertainty import scatter_covariance
@@ -187,7 +189,8 @@ def deviation(
     part; by default 2 % of its diagonal, never below ten times the noise. ``initial`` (4, 4) scan
     to nominal: replaces the search. ``views``: of each view the centres (k, 3) mm of its devices,
     in the scan's frame, which all have to see a place; all places are visible without, and None is
-    for a scan that no camera at its origin saw. Raises SlviewerError where the two cannot be aligned with trust.
+    for a scan that no camera at its origin saw. Raises SlviewerError where the two cannot be
+    aligned with trust.
     """
     report = progress or (lambda share: None)
     points = np.asarray(points, np.float64)
@@ -214,13 +217,17 @@ def deviation(
     if turned.any():
         faces = np.where(turned[:, None], nominal.faces[:, ::-1], nominal.faces)
         surface = NominalSurface(Mesh(nominal.vertices, faces))
-    T, alignment, spread = _refine_best_fit(
-        points, normals, surface, T, reach_mm, lambda share: report(0.6 + 0.2 * share)
-    )
-    report(0.8)
-    scan = _locate(points, normals, surface, T, reach_mm, sigma_mm or 0.0)
+    placed = _Placement.fit(points, normals, surface, T, reach_mm, sigma_mm, views)
+    own = np.isfinite(placed.found.signed)
+    if initial is None and 0.01 < np.mean(~own) < 0.5:  # a clamp draws the pose to itself
+        facing = None if normals is None else normals[own]
+        with suppress(InputError):
+            T = improve_pose(points[own], facing, surface, sigma_mm, placed.T)
+            placed = _Placement.fit(points, normals, surface, T, reach_mm, sigma_mm, views, own)
+    report(0.9)
+    T, scan, found = placed.T, placed.scan, placed.found
+    alignment, spread = placed.alignment_mm, placed.spread
     placed_views = [move_points(T, centres) for centres in views or ()]
-    found = classify_points(scan, surface, reach_mm, placed_views)
     counted = np.isfinite(found.signed)
     if not (counted & ~found.is_unmatched).any():
         raise InputError(
@@ -247,6 +254,38 @@ def deviation(
         scan.normals,
         int(turned.sum()),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Placement:
+    """A scan at its best fit ``T`` (4, 4): its points there, what each is, and the uncertainty."""
+
+    T: Floats
+    scan: LocatedPoints
+    found: ClassifiedPoints
+    alignment_mm: float
+    spread: Uncertainty
+
+    @classmethod
+    def fit(
+        cls,
+        points: Floats,
+        normals: Floats | None,
+        surface: NominalSurface,
+        T: Floats,
+        reach: float,
+        sigma_mm: float | None,
+        views: Sequence[Floats] | None,
+        own: Mask | None = None,
+    ) -> "_Placement":
+        """Fit a scan from ``T`` (4, 4), by its ``own`` (n,) points alone, and classify all."""
+        used = slice(None) if own is None else own
+        facing = None if normals is None else normals[used]
+        T, alignment, spread = _refine_best_fit(points[used], facing, surface, T, reach)
+        scan = _locate(points, normals, surface, T, reach, sigma_mm or 0.0)
+        placed_views = [move_points(T, centres) for centres in views or ()]
+        found = classify_points(scan, surface, reach, placed_views)
+        return cls(T, scan, found, alignment, spread)
 
 
 def _search_pose(
@@ -300,13 +339,12 @@ def _refine_best_fit(
     surface: NominalSurface,
     T: np.ndarray,
     reach: float,
-    report: Progress,
 ) -> tuple[np.ndarray, float, Uncertainty]:
     """The pose of least squared distances of the points that belong to the nominal, the standard
     uncertainty, mm, that its own gives the points, and its covariance."""
     points = subsample(points, MAX_ALIGNED_POINTS)
     normals = None if normals is None else subsample(normals, MAX_ALIGNED_POINTS)
-    T, moved, J, away = fit_pose(points, normals, surface, T, reach, report=report)
+    T, moved, J, away = fit_pose(points, normals, surface, T, reach)
     for _ in range(ROBUST_ROUNDS):
         gate = ROBUST_SIGMAS * robust_sigma(away, about=0.0)
         if not 0 < gate < ROBUST_STEP * reach:

@@ -214,6 +214,8 @@ REACH = 0.02
 clamp."""
 GOOD_ERROR = 0.002
 """Of the nominal's diagonal, or thrice the noise: points fit well that deviate less."""
+EXACT_AGREEMENT = 0.995
+"""Share of the points nearby that fit well: fewer may be small features out of place."""
 GOOD_OVERLAP, GOOD_AGREEMENT, NEAR = 0.6, 0.95, 5.0
 """Shares of the scan, and of its points within so many reaches of the nominal, that fit well: no
 better pose is searched for."""
@@ -232,9 +234,11 @@ VIEWS = [
 ]
 """From where a model is looked at: its sides, from below and above first, then its edges, then its
 corners."""
-TURN_ROUNDS, SCREENED_POINTS, RIVAL_SHARE = 3, 600, (0.4, 0.75)
-"""Points of a scan that turned poses are tried on, and the share of those on the model that must
-lie on it then, too; the first where the pose is not good."""
+TURNED_POINTS, TURN_ROUNDS = 1_000, 3
+RIVAL_SHARE = 0.6
+"""Of the points that lie near the model: so many do at a turned pose that is tried."""
+NUDGE_DEG, NUDGED = 3.0, 4
+"""How far, and how many of the best turned poses, are turned on."""
 RIGHT_TURNS = [
     sign[:, None] * np.eye(3)[list(order)]
     for order in permutations(range(3))
@@ -254,7 +258,7 @@ class NominalPose:
     ``cost``: mean of the points' squared distances over that of the reach, each at most 1, and up
     to twice as large where they show the surface from behind. ``overlap``: share of the scan on the
     nominal; ``agreement``: share of these among the points that face it nearby. ``is_good``: nearly
-    all points fit well. ``gate_mm``: distance of the points on it.
+    all points fit well, ``is_exact``: all but a few. ``gate_mm``: distance of the points on it.
     """
 
     T: Floats
@@ -262,6 +266,7 @@ class NominalPose:
     overlap: float
     agreement: float
     is_good: bool
+    is_exact: bool
     gate_mm: float
 
     @property
@@ -362,12 +367,7 @@ def search_pose(
             f"{NOT_ALIGNED}: at most {100 * score:.0f} % of it lies on a side of the model, in any"
             " of its poses.",
         )
-    for _ in range(TURN_ROUNDS):
-        before = best
-        turned = _list_right_turns(few, few_normals, surface, best)
-        best = _choose_pose(few, few_normals, surface, sigma_mm, turned, best) or best
-        if best is before or best.is_good:
-            break
+    best = _improve_pose(few, few_normals, surface, sigma_mm, best)
     _refuse_if_doubtful(best)
     T, shape = _settle(few, few_normals, surface, best, MOST_SLACK * scan.size)
     if shape is not None:
@@ -397,24 +397,63 @@ def _choose_pose(
     return best
 
 
-def _list_right_turns(
-    points: Floats, normals: Floats | None, surface: NominalSurface, pose: NominalPose
-) -> list[Floats]:
-    """Return poses (4, 4) turned by right angles about the model's main axes that fit nearly as
-    well as ``pose``: a plate fits in four ways, but for its small features."""
-    some = subsample(points, SCREENED_POINTS)
-    own = None if normals is None else subsample(normals, SCREENED_POINTS)
-    reach = REACH * surface.diagonal
-
-    def share_on(T: Floats) -> float:
-        """Share of the scan on the model at a pose."""
-        return float(np.isfinite(surface.distances(some, own, T, 2 * reach)[0]).mean())
-
+def _improve_pose(
+    points: Floats,
+    normals: Floats | None,
+    surface: NominalSurface,
+    sigma_mm: float | None,
+    pose: NominalPose,
+) -> NominalPose:
+    """Return the pose of least cost among those turned by right angles about the model's main axes,
+    as a plate fits in four ways but for its small features; and where no pose is good, by a few
+    degrees from there."""
+    some = subsample(points, TURNED_POINTS)
+    own = None if normals is None else subsample(normals, TURNED_POINTS)
     axes, middle = surface.main_axes()
-    least = RIVAL_SHARE[pose.is_good] * share_on(pose.T)
-    turns = [axes @ turn @ axes.T for turn in RIGHT_TURNS]
-    moved = [rigid_transform(R, middle - R @ middle) @ pose.T for R in turns]
-    return [T for T in moved if share_on(T) >= least]
+    turns = [
+        rigid_transform(axes @ R @ axes.T, middle - axes @ R @ axes.T @ middle) for R in RIGHT_TURNS
+    ]
+    nudges = [
+        turn_about(np.radians(NUDGE_DEG) * sign * axis, middle)
+        for axis in axes.T
+        for sign in (-1, 1)
+    ]
+    for _ in range(TURN_ROUNDS):
+        tried = [pose.T, *(turn @ pose.T for turn in turns)]
+        shares = [_share_on(some, own, surface, T) for T in tried]
+        order = [k for k in np.argsort(shares)[::-1] if shares[k] >= RIVAL_SHARE * shares[0]]
+        starts = [tried[k] for k in order if k]
+        if not pose.is_exact:
+            starts += [nudge @ tried[k] for k in order[:NUDGED] for nudge in nudges]
+        with suppress(InputError):
+            now = _fit_start(some, own, surface, pose.T, sigma_mm)
+            other = _choose_pose(some, own, surface, sigma_mm, starts, now)
+            if other is not None and other.cost < BETTER_COST * now.cost:
+                better = _fit_start(points, normals, surface, other.T, sigma_mm)
+                if better.cost < pose.cost:
+                    pose = better
+                    continue
+        break
+    return pose
+
+
+def improve_pose(
+    points: Floats,
+    normals: Floats | None,
+    surface: NominalSurface,
+    sigma_mm: float | None,
+    T: Floats,
+) -> Floats:
+    """Return the pose (4, 4) of least cost about ``T`` (4, 4) and its right turns."""
+    few = subsample(points, FITTED_POINTS)
+    own = None if normals is None else subsample(normals, FITTED_POINTS)
+    return _improve_pose(few, own, surface, sigma_mm, _fit_start(few, own, surface, T, sigma_mm)).T
+
+
+def _share_on(points: Floats, normals: Floats | None, surface: NominalSurface, T: Floats) -> float:
+    """Return the share of a scan near the model at a pose."""
+    off = surface.distances(points, normals, T, 2 * REACH * surface.diagonal)[0]
+    return float(np.isfinite(off).mean())
 
 
 def _list_sides(
@@ -455,15 +494,15 @@ def _fit_start(
         T = fit_pose(points, normals, surface, T, within, robust=True)[0]
     near = np.abs(surface.signed(move_points(T, points))[0]) < NEAR * reach
     off = np.abs(surface.distances(points, normals, T, 4 * gate, either_side=True)[0])
+    fitting = np.sum(off <= good)
     behind = np.sum(off < gate) - np.isfinite(surface.distances(points, normals, T, gate)[0]).sum()
     return NominalPose(
         T,
         cost=(1 + behind / len(points)) * float(np.mean(_cap(off / reach))),
         overlap=float(np.mean(off <= gate)),
         agreement=float(np.sum(off <= gate) / max(1, np.isfinite(off).sum())),
-        is_good=bool(
-            np.sum(off <= good) >= max(GOOD_OVERLAP * len(points), GOOD_AGREEMENT * np.sum(near))
-        ),
+        is_good=bool(fitting >= max(GOOD_OVERLAP * len(points), GOOD_AGREEMENT * np.sum(near))),
+        is_exact=bool(fitting >= EXACT_AGREEMENT * np.sum(near)),
         gate_mm=gate,
     )
 
@@ -508,7 +547,8 @@ def _settle(
 
 def _refuse_if_doubtful(pose: NominalPose) -> None:
     """Raise ``Refused`` for a pose that does not fit."""
-    if pose.overlap < LEAST_OVERLAP or pose.agreement < LEAST_AGREEMENT:
+    is_likely = pose.overlap >= GOOD_OVERLAP  # a bent part; its deviations say so
+    if pose.overlap < LEAST_OVERLAP or (pose.agreement < LEAST_AGREEMENT and not is_likely):
         raise Refused(
             "disagree",
             f"{NOT_ALIGNED}: in the best pose only {100 * pose.overlap:.0f} % of it lies on the"

@@ -7,7 +7,7 @@ such local mean is judged; a few points in one place weigh as much as a whole si
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -167,25 +167,26 @@ def _judge_end(means: _Means, end: int, tolerance: float) -> tuple[float, Decisi
 
 def _list_points(deviation: Deviation, sigma_mm: Floats, common_mm: Floats | None) -> _Points:
     """Return the deviations of a scan, combined to at most about `MOST_MEANS`."""
-    T, counted = deviation.T_nominal_scan, deviation.counted
-    places, normals = deviation.located[counted], deviation.normals[counted] @ T[:3, :3].T
-    own = deviation.facing
-    facing = normals if own is None else np.where(np.isfinite(own[counted]), own[counted], normals)
+    counted = deviation.counted
+    facing = deviation.facing
+    if facing is None or not np.isfinite(facing[counted]).all():
+        towards = deviation.normals @ deviation.T_nominal_scan[:3, :3].T
+        facing = towards if facing is None else np.where(np.isfinite(facing), facing, towards)
     value = deviation.signed[counted].astype(np.float64)
     noise = np.maximum(np.nan_to_num(sigma_mm[counted]).astype(np.float64), deviation.noise_mm)
     common = np.zeros(len(value)) if common_mm is None else np.nan_to_num(common_mm[counted])
-    spread = deviation.alignment_spread
-    J = distance_jacobian(places - spread.centre, normals.astype(np.float64))
-    # the part's form is no uncertainty of a best fit to it
-    matched = value[~deviation.is_unmatched[counted]]
-    share = min(1.0, float(np.median(noise)) / max(rms(matched), 1e-12))
-    aligned = share**2 * np.einsum("ni,ij,nj->n", J, spread.covariance, J)
-    common = np.sqrt(common.astype(np.float64) ** 2 + aligned)
     unmatched = deviation.is_unmatched[counted]
-    points = _Points(places, facing, value, noise, common, unmatched)
-    if len(points) <= MOST_MEANS:
-        return points
-    return _combine(points, deviation.area.spacing_mm * np.sqrt(len(points) / MOST_MEANS) / 3)
+    places = deviation.located[counted]
+    points = _Points(places, facing[counted], value, noise, common.astype(np.float64), unmatched)
+    # the part's form is no uncertainty of a best fit to it
+    share = min(1.0, float(np.median(noise)) / max(rms(value[~unmatched]), 1e-12))
+    if len(points) > MOST_MEANS:
+        side = deviation.area.spacing_mm * np.sqrt(len(points) / MOST_MEANS) / 3
+        points = _combine(points, side)
+    spread = deviation.alignment_spread
+    J = distance_jacobian(points.place - spread.centre, points.facing)
+    aligned = share * np.sqrt(np.einsum("ni,ij,nj->n", J, spread.covariance, J))
+    return replace(points, common=np.hypot(points.common, aligned))
 
 
 def _combine(points: _Points, side: float) -> _Points:
