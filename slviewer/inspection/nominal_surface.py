@@ -237,7 +237,7 @@ corners."""
 TURNED_POINTS, TURN_ROUNDS = 1_000, 3
 RIVAL_SHARE = 0.6
 """Of the points that lie near the model: so many do at a turned pose that is tried."""
-NUDGE_DEG, NUDGED = 3.0, 4
+NUDGES_DEG, NUDGED = (-4.0, -1.0, 1.0, 4.0), 3
 """How far, and how many of the best turned poses, are turned on."""
 RIGHT_TURNS = [
     sign[:, None] * np.eye(3)[list(order)]
@@ -413,13 +413,11 @@ def _improve_pose(
     turns = [
         rigid_transform(axes @ R @ axes.T, middle - axes @ R @ axes.T @ middle) for R in RIGHT_TURNS
     ]
-    nudges = [
-        turn_about(np.radians(NUDGE_DEG) * sign * axis, middle)
-        for axis in axes.T
-        for sign in (-1, 1)
-    ]
+    nudges = [turn_about(np.radians(deg) * axis, middle) for axis in axes.T for deg in NUDGES_DEG]
     for _ in range(TURN_ROUNDS):
-        tried = [pose.T, *(turn @ pose.T for turn in turns)]
+        tried = [pose.T]
+        for T in [turn @ pose.T for turn in turns]:
+            tried += _shift_flat(some, surface, axes, T)
         shares = [_share_on(some, own, surface, T) for T in tried]
         order = [k for k in np.argsort(shares)[::-1] if shares[k] >= RIVAL_SHARE * shares[0]]
         starts = [tried[k] for k in order if k]
@@ -435,6 +433,17 @@ def _improve_pose(
                     continue
         break
     return pose
+
+
+def _shift_flat(points: Floats, surface: NominalSurface, axes: Floats, T: Floats) -> list[Floats]:
+    """Return a pose (4, 4) as it is, and shifted along the model's shortest side so that the upper
+    or the lower ends of scan and model meet: turned over, a plate lies elsewhere."""
+    model = surface.vertices @ axes
+    short = int(np.argmin(np.ptp(model, axis=0)))
+    ends = np.percentile(move_points(T, points) @ axes[:, short], [1, 99])
+    shifts = np.array([model[:, short].min(), model[:, short].max()]) - ends
+    moves = [rigid_transform(np.eye(3), shift * axes[:, short]) for shift in shifts]
+    return [T, *(move @ T for move in moves)]
 
 
 def improve_pose(
