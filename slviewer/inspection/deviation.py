@@ -2,8 +2,7 @@
 colours; and what of the nominal was measured, and what of it is missing."""
 
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -49,6 +48,8 @@ MIN_GAP_COSINE = 0.3
 RAY_NEIGHBOURS, LEAST_ON_RAY, RAY_SPACINGS = 24, 6, 1.5
 """Points about a ray, of which at least six must be there, and all lie behind a place that is
 missing; and their distance from it over that which most neighbours keep threefold."""
+MIN_FOREIGN, MAX_FOREIGN = 0.01, 0.5
+"""Share of a scan that is not the part, between which the pose is searched again without it."""
 COVERAGE_SAMPLES = 20_000
 MIN_SEEN_COSINE = 0.45
 """Of a place on the nominal that a view can measure: at more oblique ones points are few."""
@@ -204,30 +205,17 @@ def deviation(
     if not reach_mm > 0:
         raise InputError(f"A reach of {reach_mm:g} mm was given: give a positive one.")
     report(0.0)
-    T = initial
+    given, T = _Scan(points, normals, sigma_mm, views), initial
     if T is None:
-        shown = find_tables(points, surface, sigma_mm or 0.0)
-        facing = None if normals is None else normals[~shown]
-        T = _search_pose(
-            points[~shown], facing, surface, sigma_mm, views, lambda x: report(0.6 * x)
-        )
-    turned = np.zeros(len(nominal.faces), bool)
-    if normals is not None:
-        turned = surface.seen_from_behind(points, normals, T, reach_mm)
-    if turned.any():
-        faces = np.where(turned[:, None], nominal.faces[:, ::-1], nominal.faces)
-        surface = NominalSurface(Mesh(nominal.vertices, faces))
-    placed = _Placement.fit(points, normals, surface, T, reach_mm, sigma_mm, views)
-    own = np.isfinite(placed.found.signed)
-    if initial is None and 0.01 < np.mean(~own) < 0.5:  # a clamp draws the pose to itself
-        facing = None if normals is None else normals[own]
-        with suppress(InputError):
-            T = improve_pose(points[own], facing, surface, sigma_mm, placed.T)
-            placed = _Placement.fit(points, normals, surface, T, reach_mm, sigma_mm, views, own)
+        part = given.take(~find_tables(points, surface, sigma_mm or 0.0))
+        T = _search_pose(part, surface, lambda share: report(0.6 * share))
+    surface, turned = _turn_faces(points, normals, surface, T, reach_mm)
+    placed = _Placement.fit(given, given, surface, T, reach_mm)
+    if initial is None:
+        placed = placed.without_foreign(given, surface, reach_mm)
     report(0.9)
     T, scan, found = placed.T, placed.scan, placed.found
     alignment, spread = placed.alignment_mm, placed.spread
-    placed_views = [move_points(T, centres) for centres in views or ()]
     counted = np.isfinite(found.signed)
     if not (counted & ~found.is_unmatched).any():
         raise InputError(
@@ -235,7 +223,7 @@ def deviation(
             " that part?"
         )
     report(0.95)
-    area = _measure_area(scan, found, surface, placed_views)
+    area = _measure_area(scan, found, surface, given.place_views(T))
     report(1.0)
     towards = np.where(counted[:, None], scan.towards, np.nan)
     return Deviation(
@@ -252,8 +240,27 @@ def deviation(
         scan.noise_mm,
         scan.points,
         scan.normals,
-        int(turned.sum()),
+        turned,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    """A scan, as the arguments of `deviation`."""
+
+    points: Floats
+    normals: Floats | None
+    sigma_mm: float | None
+    views: Sequence[Floats] | None
+
+    def take(self, chosen: Mask) -> "_Scan":
+        """Return some of the points (n,) bool."""
+        normals = None if self.normals is None else self.normals[chosen]
+        return replace(self, points=self.points[chosen], normals=normals)
+
+    def place_views(self, T: Floats) -> list[Floats]:
+        """Return the views in the nominal's frame."""
+        return [move_points(T, centres) for centres in self.views or ()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,41 +275,48 @@ class _Placement:
 
     @classmethod
     def fit(
-        cls,
-        points: Floats,
-        normals: Floats | None,
-        surface: NominalSurface,
-        T: Floats,
-        reach: float,
-        sigma_mm: float | None,
-        views: Sequence[Floats] | None,
-        own: Mask | None = None,
+        cls, scan: _Scan, own: _Scan, surface: NominalSurface, T: Floats, reach: float
     ) -> "_Placement":
-        """Fit a scan from ``T`` (4, 4), by its ``own`` (n,) points alone, and classify all."""
-        used = slice(None) if own is None else own
-        facing = None if normals is None else normals[used]
-        T, alignment, spread = _refine_best_fit(points[used], facing, surface, T, reach)
-        scan = _locate(points, normals, surface, T, reach, sigma_mm or 0.0)
-        placed_views = [move_points(T, centres) for centres in views or ()]
-        found = classify_points(scan, surface, reach, placed_views)
-        return cls(T, scan, found, alignment, spread)
+        """Fit a scan from ``T`` (4, 4), by its ``own`` points alone, and classify all."""
+        T, alignment, spread = _refine_best_fit(own.points, own.normals, surface, T, reach)
+        located = _locate(scan.points, scan.normals, surface, T, reach, scan.sigma_mm or 0.0)
+        found = classify_points(located, surface, reach, scan.place_views(T))
+        return cls(T, located, found, alignment, spread)
+
+    def without_foreign(self, scan: _Scan, surface: NominalSurface, reach: float) -> "_Placement":
+        """Fit again without what is not the part, as a clamp, which draws the pose to itself."""
+        counted = np.isfinite(self.found.signed)
+        if not MIN_FOREIGN < np.mean(~counted) < MAX_FOREIGN:
+            return self
+        own = scan.take(counted)
+        try:
+            T = improve_pose(own.points, own.normals, surface, own.sigma_mm, self.T)
+            return self.fit(scan, own, surface, T, reach)
+        except InputError:  # too few points are left
+            return self
 
 
-def _search_pose(
-    points: Floats,
-    normals: Floats | None,
-    surface: NominalSurface,
-    sigma_mm: float | None,
-    views: Sequence[Floats] | None,
-    report: Progress,
-) -> Floats:
+def _turn_faces(
+    points: Floats, normals: Floats | None, surface: NominalSurface, T: Floats, reach: float
+) -> tuple[NominalSurface, int]:
+    """The nominal with the triangles turned that the scan shows from behind, and their number."""
+    if normals is None:
+        return surface, 0
+    turned, mesh = surface.seen_from_behind(points, normals, T, reach), surface.mesh
+    if not turned.any():
+        return surface, 0
+    faces = np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces)
+    return NominalSurface(Mesh(mesh.vertices, faces)), int(turned.sum())
+
+
+def _search_pose(scan: _Scan, surface: NominalSurface, report: Progress) -> Floats:
     """The pose (4, 4) of a scan on the nominal. Raises ``WrongPart`` where there is none, and the
     scan fits another model, else ``Refused``."""
-    has_camera = views is not None
+    points, normals, has_camera = scan.points, scan.normals, scan.views is not None
     try:
-        return search_pose(points, normals, surface, sigma_mm, report, has_camera)
+        return search_pose(points, normals, surface, scan.sigma_mm, report, has_camera)
     except Refused as refusal:
-        near = max(GOOD_ERROR * surface.diagonal, NOISE * (sigma_mm or 0.0))
+        near = max(GOOD_ERROR * surface.diagonal, NOISE * (scan.sigma_mm or 0.0))
         other = explain_misfit(points, normals, surface.mesh, None, near, has_camera)
         if other:
             raise WrongPart(f"The scan does not show the nominal model: {other}.") from refusal

@@ -409,30 +409,37 @@ def _improve_pose(
     degrees from there."""
     some = subsample(points, TURNED_POINTS)
     own = None if normals is None else subsample(normals, TURNED_POINTS)
-    axes, middle = surface.main_axes()
-    turns = [
-        rigid_transform(axes @ R @ axes.T, middle - axes @ R @ axes.T @ middle) for R in RIGHT_TURNS
-    ]
-    nudges = [turn_about(np.radians(deg) * axis, middle) for axis in axes.T for deg in NUDGES_DEG]
     for _ in range(TURN_ROUNDS):
-        tried = [pose.T]
-        for T in [turn @ pose.T for turn in turns]:
-            tried += _shift_flat(some, surface, axes, T)
-        shares = [_share_on(some, own, surface, T) for T in tried]
-        order = [k for k in np.argsort(shares)[::-1] if shares[k] >= RIVAL_SHARE * shares[0]]
-        starts = [tried[k] for k in order if k]
-        if not pose.is_exact:
-            starts += [nudge @ tried[k] for k in order[:NUDGED] for nudge in nudges]
+        starts = _list_turned(some, own, surface, pose)
         with suppress(InputError):
             now = _fit_start(some, own, surface, pose.T, sigma_mm)
-            other = _choose_pose(some, own, surface, sigma_mm, starts, now)
-            if other is not None and other.cost < BETTER_COST * now.cost:
+            other = _choose_pose(some, own, surface, sigma_mm, starts, now) or now
+            if other.cost < BETTER_COST * now.cost:
                 better = _fit_start(points, normals, surface, other.T, sigma_mm)
                 if better.cost < pose.cost:
                     pose = better
                     continue
         break
     return pose
+
+
+def _list_turned(
+    points: Floats, normals: Floats | None, surface: NominalSurface, pose: NominalPose
+) -> list[Floats]:
+    """Return poses (4, 4) at which nearly as much of a scan lies near the model: turned by right
+    angles, and on by a few degrees where the ``pose`` is not exact."""
+    axes, middle = surface.main_axes()
+    turns = [axes @ R @ axes.T for R in RIGHT_TURNS]
+    tried = [pose.T]
+    for T in [rigid_transform(R, middle - R @ middle) @ pose.T for R in turns]:
+        tried += _shift_flat(points, surface, axes, T)
+    shares = [_share_on(points, normals, surface, T) for T in tried]
+    order = [k for k in np.argsort(shares)[::-1] if shares[k] >= RIVAL_SHARE * shares[0]]
+    starts = [tried[k] for k in order if k]
+    if pose.is_exact:
+        return starts
+    nudges = [turn_about(np.radians(deg) * axis, middle) for axis in axes.T for deg in NUDGES_DEG]
+    return starts + [nudge @ tried[k] for k in order[:NUDGED] for nudge in nudges]
 
 
 def _shift_flat(points: Floats, surface: NominalSurface, axes: Floats, T: Floats) -> list[Floats]:
