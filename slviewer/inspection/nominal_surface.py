@@ -210,8 +210,7 @@ MAX_POINTS, FITTED_POINTS = 40_000, 3_000
 MIN_VISIBLE = 2_000
 MIN_COUNTED = 100
 REACH = 0.02
-"""Of the nominal's diagonal: scan points farther from it belong to something else, a table or a
-clamp."""
+"""Of the nominal's diagonal: scan points farther from it do not count in the best fit."""
 GOOD_ERROR = 0.002
 """Of the nominal's diagonal, or thrice the noise: points fit well that deviate less."""
 EXACT_AGREEMENT = 0.995

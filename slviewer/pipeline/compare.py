@@ -56,8 +56,8 @@ class CompareSettings:
             answer; with less it is undecided.
         units: What the file's numbers are; required where its size does not fit the scan's. STEP
             and 3MF state theirs.
-        reach: Points farther than this from the nominal, mm, belong to something else (a table, a
-            clamp); by default 2 % of the nominal's diagonal.
+        reach: Points farther than this from the nominal, mm, do not count in the best fit, and are
+            deviations unless they stand beside the part; by default 2 % of the nominal's diagonal.
         out: PLY file, the deviation as a scalar and as colours; by default in the session's
             exports.
         model: Which calibration to use; by default the best one available.
