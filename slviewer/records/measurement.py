@@ -341,6 +341,8 @@ class NominalDeviation(msgspec.Struct, frozen=True):
         ]
         share = 100 * numbers.left_out / max(numbers.points + numbers.left_out, 1)
         excluded = "; ".join(each.text() for each in self.excluded) or "none is excluded"
+        if numbers.left_out and not self.excluded:  # a record of an earlier version
+            excluded = f"they lie farther than {self.reach_mm:.3g} mm from it or face another way"
         size = (
             ""
             if nominal.size_mm is None

@@ -12,7 +12,12 @@ from facts import missing_facts, raises
 from slviewer.calibration.splined import model as splined
 from slviewer.errors import InputError, SessionError
 from slviewer.pipeline import models
-from slviewer.pipeline.models import available_models, load_model, preferred_model, warn_if_stale
+from slviewer.pipeline.models import (
+    available_models,
+    load_model,
+    preferred_model,
+    warn_of_calibration,
+)
 from slviewer.pipeline.operation import save_record
 from slviewer.records.acceptance import HeldOutError, ModelComparison
 from slviewer.session.store import Session
@@ -89,13 +94,13 @@ def test_what_is_stale_is_told_in_one_sentence(tmp_path: Path) -> None:
     with Session.create(tmp_path / "session") as store:
         for name in ("stereo", "splined"):
             store.save_result(f"calibration/{name}", {"inputs": {}}, {"z": np.eye(2)})
-        warn_if_stale(store, said.append)
+        warn_of_calibration(store, said.append)
         assert not said
         for name in ("stereo", "splined"):
             store.save_result(
                 f"calibration/{name}", {"inputs": {"pose_01": "gone"}}, {"z": np.eye(2)}
             )
-        warn_if_stale(store, said.append)
+        warn_of_calibration(store, said.append)
     (sentence,) = said
     assert not missing_facts(sentence, "stereo", "splined")
 

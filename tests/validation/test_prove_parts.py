@@ -12,7 +12,7 @@ WRONG = replace(RIGHT, fault="moved", size=5.0)
 
 
 def judged(setup, verdict, *, in_view=True, right=None):
-    return JudgedCase(setup, verdict, in_view, 1.0, 9, right, right, (), "", 0.1)
+    return JudgedCase(setup, verdict, False, in_view, 1.0, 9, right, right, (), "", 0.1)
 
 
 @pytest.mark.parametrize(
