@@ -340,9 +340,6 @@ class NominalDeviation(msgspec.Struct, frozen=True):
             for each in figures
         ]
         share = 100 * numbers.left_out / max(numbers.points + numbers.left_out, 1)
-        excluded = "; ".join(each.text() for each in self.excluded) or "none is excluded"
-        if numbers.left_out and not self.excluded:  # a record of an earlier version
-            excluded = f"they lie farther than {self.reach_mm:.3g} mm from it or face another way"
         size = (
             ""
             if nominal.size_mm is None
@@ -354,13 +351,19 @@ class NominalDeviation(msgspec.Struct, frozen=True):
             *(f"{nominal.name}: {note}." for note in nominal.notes),
             (
                 f"{numbers.points:,} points; {numbers.left_out:,} ({share:.1f} %) are not taken for"
-                f" the part: {excluded}. The best fit adds {self.alignment_mm:.4f} mm (1 sigma)."
+                f" the part: {self._describe_excluded()}. The best fit adds {self.alignment_mm:.4f} mm (1 sigma)."
             ),
             *(f"{warning}." for warning in warnings),
             *([] if verdict is None else [f"{verdict.text()}. It is {RULE}."]),
             *([] if verdict is None else filter(None, [verdict.describe_evidence()])),
         ]
         return Table.of(rows, f"Deviation from nominal: {name}", notes).without_empty()
+
+    def _describe_excluded(self) -> str:
+        """Return what was excluded, in words."""
+        if self.statistics_mm.left_out and not self.excluded:  # a record of an earlier version
+            return f"they lie farther than {self.reach_mm:.3g} mm from it or face another way"
+        return "; ".join(each.text() for each in self.excluded) or "none is excluded"
 
     def list_places(self, name: str) -> Table:
         """Return the table of the places out of tolerance."""
