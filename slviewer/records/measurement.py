@@ -139,7 +139,7 @@ class DeviationStatistics(msgspec.Struct, frozen=True):
 
 
 Exclusion = Literal["alone", "table", "beside", "touching", "border"]
-"""Why points of a scan are not taken for the part: spikes; a plane that the part stands on;
+"""Why points of a scan are excluded from the part: spikes; a plane that the part stands on;
 something beside its footprint that does not touch it, or does; points at the border of these."""
 EXCLUSIONS: dict[Exclusion, str] = {
     "alone": "isolated points",
@@ -158,7 +158,7 @@ PLACE_KINDS: dict[PlaceKind, str] = {
 
 
 class ExcludedPoints(msgspec.Struct, frozen=True):
-    """Points of a scan that are not taken for the part: why, how many, and where: their middle in
+    """Points of a scan that are excluded from the part: why, how many, and where: their middle in
     the nominal's frame and their extent, mm."""
 
     reason: Exclusion
@@ -350,8 +350,9 @@ class NominalDeviation(msgspec.Struct, frozen=True):
             f"{source} against {nominal.name}{triangles}{size}.",
             *(f"{nominal.name}: {note}." for note in nominal.notes),
             (
-                f"{numbers.points:,} points; {numbers.left_out:,} ({share:.1f} %) are not taken for"
-                f" the part: {self._describe_excluded()}. The best fit adds {self.alignment_mm:.4f} mm (1 sigma)."
+                f"{numbers.points:,} points; {numbers.left_out:,} ({share:.1f} %) are excluded:"
+                f" {self._describe_excluded()}. The best fit adds {self.alignment_mm:.4f} mm"
+                " (1 sigma)."
             ),
             *(f"{warning}." for warning in warnings),
             *([] if verdict is None else [f"{verdict.text()}. It is {RULE}."]),
