@@ -39,7 +39,7 @@ class UnsuitedPartError(ValueError):
 
 
 @dataclass(frozen=True)
-class Feature:
+class PartFeature:
     """A boss, or with negative ``height`` a pocket (-inf: a through hole), mm.
 
     ``half``: half its widths. ``is_dome``: it rises smoothly, as dirt or a dent. On a free form a
@@ -93,14 +93,14 @@ class Part:
     is_free_form: bool
     is_open: bool
     splits: int
-    features: tuple[Feature, ...] = ()
+    features: tuple[PartFeature, ...] = ()
 
     @property
     def size(self) -> float:
         """Length of the plate's diagonal, mm."""
         return float(2 * np.hypot(self.edges[-1], self.half_width))
 
-    def add(self, feature: Feature) -> "Part":
+    def add(self, feature: PartFeature) -> "Part":
         """The part with one more feature."""
         return replace(self, features=(*self.features, feature))
 
@@ -182,7 +182,7 @@ def _flat_face(
     return corners
 
 
-def _feature_faces(feature: Feature, level: float, bottom: float) -> list[Floats]:
+def _feature_faces(feature: PartFeature, level: float, bottom: float) -> list[Floats]:
     """Triangles (m, 3, 3) of the faces of a feature that stands on a level."""
     top = max(bottom, level + feature.height)
     rings = [feature.ring(level), feature.ring(top)]
@@ -222,7 +222,7 @@ def draw_part(rng: np.random.Generator, kind: PartKind) -> Part:
     return part
 
 
-def draw_feature(rng: np.random.Generator, part: Part, kind: PartKind) -> Feature:
+def draw_feature(rng: np.random.Generator, part: Part, kind: PartKind) -> PartFeature:
     """A feature of a kind at no place yet."""
     uniform = rng.uniform
     if kind == "steps":
@@ -237,10 +237,10 @@ def draw_feature(rng: np.random.Generator, part: Part, kind: PartKind) -> Featur
     }
     is_round, (a, b), height = options[kind]
     half = part.size * a, part.size * (a if is_round else b)
-    return Feature((0.0, 0.0), half, uniform(0, np.pi), part.size * height, is_round)
+    return PartFeature((0.0, 0.0), half, uniform(0, np.pi), part.size * height, is_round)
 
 
-def place_feature(rng: np.random.Generator, part: Part, feature: Feature) -> Feature:
+def place_feature(rng: np.random.Generator, part: Part, feature: PartFeature) -> PartFeature:
     """The feature at a place that has room for it, shortened if need be. Raises UnsuitedPartError
     where none has."""
     gap = GAP * part.size
@@ -293,7 +293,7 @@ def draw_change(rng: np.random.Generator, part: Part, kind: PartKind, fault: Loc
     return change
 
 
-def _change_feature(feature: Feature, fault: str, amount: float, way: float) -> Feature:
+def _change_feature(feature: PartFeature, fault: str, amount: float, way: float) -> PartFeature:
     """The feature changed by an amount, mm; ``way``: direction of a shift, radians."""
     (x, y), (a, b), height = feature.centre, feature.half, feature.height
     is_slim = not feature.is_round and max(a, b) > 1.5 * min(a, b)
@@ -310,7 +310,9 @@ def _change_feature(feature: Feature, fault: str, amount: float, way: float) -> 
     return replace(feature, half=(a + amount, b + amount * feature.is_round))
 
 
-def _draw_added(rng: np.random.Generator, part: Part, kind: PartKind, fault: LocalFault) -> Feature:
+def _draw_added(
+    rng: np.random.Generator, part: Part, kind: PartKind, fault: LocalFault
+) -> PartFeature:
     """A feature of the height 1 or -1: one that is missing or too many, a burr along the part's
     edge, dirt on it, or a dent in it."""
     if fault == "burr" and not part.is_free_form:
@@ -321,37 +323,37 @@ def _draw_added(rng: np.random.Generator, part: Part, kind: PartKind, fault: Loc
             rng.uniform(0.1, 0.3) * GAP * part.size,
         )
         x = rng.uniform(start + 1.1 * length, end - 1.1 * length)
-        return Feature(
+        return PartFeature(
             (x, rng.choice([-1, 1]) * (part.half_width - 1.1 * width)), (length, width), 0, 1
         )
     feature = draw_feature(rng, part, kind)
     if fault in ("burr", "dirt", "dent"):
         radius = part.size * rng.uniform(0.02, 0.04)
-        feature = Feature((0, 0), (radius, radius), 0, -1 if fault == "dent" else 1, True, True)
+        feature = PartFeature((0, 0), (radius, radius), 0, -1 if fault == "dent" else 1, True, True)
     return place_feature(rng, part, replace(feature, height=np.sign(feature.height)))
 
 
-def solve_change(change: Change, size_mm: float) -> tuple[Part, Part]:
+def solve_part_change(change: Change, size_mm: float) -> tuple[Part, Part]:
     """The nominal and the true part that are ``size_mm`` apart. Raises UnsuitedPartError where no
     amount of the change does it."""
     amount = size_mm
     for _ in range(4):
         nominal, true = change(amount)
         coarse = [replace(part, splits=0).build() for part in (nominal, true)]
-        share = measure_size(coarse[0], coarse[1]) / size_mm
+        share = measure_largest_distance(coarse[0], coarse[1]) / size_mm
         if abs(share - 1) < MAX_SIZE_ERROR:
             return nominal, true
         amount /= share
     raise UnsuitedPartError("the fault cannot be so large")
 
 
-def measure_size(mesh: trimesh.Trimesh, other: trimesh.Trimesh, seed: int = 0) -> float:
+def measure_largest_distance(mesh: trimesh.Trimesh, other: trimesh.Trimesh, seed: int = 0) -> float:
     """The largest distance of the surface of one mesh from the other's, of both ways, mm."""
-    rng, one, two = np.random.default_rng(seed), Surface(mesh), Surface(other)
+    rng, one, two = np.random.default_rng(seed), PartSurface(mesh), PartSurface(other)
     return max(float(a.closest(b.cover(rng))[1].max()) for a, b in ((one, two), (two, one)))
 
 
-class Surface:
+class PartSurface:
     """A mesh, distances from it, mm, and rays cast at it."""
 
     def __init__(self, mesh: trimesh.Trimesh):

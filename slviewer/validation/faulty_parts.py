@@ -184,7 +184,7 @@ class FaultyPart:
         return places if seen is None else places[seen(places, normals)]
 
 
-def draw_part(rng: Rng, points: int) -> FaultyPart:
+def draw_planned_part(rng: Rng, points: int) -> FaultyPart:
     """Draw a plate with a block, a pin, a hole and a dome in six tiles, and a fault. ``points``:
     of its cloud."""
     S = float(np.exp(rng.uniform(np.log(10), np.log(400))))

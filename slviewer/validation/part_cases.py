@@ -23,12 +23,12 @@ from slviewer.simulation.parts import (
     LocalFault,
     Part,
     PartKind,
-    Surface,
+    PartSurface,
     UnsuitedPartError,
     draw_change,
     draw_part,
-    measure_size,
-    solve_change,
+    measure_largest_distance,
+    solve_part_change,
 )
 from slviewer.surface.shapes import Mesh
 
@@ -112,7 +112,7 @@ class PartCase:
         return self.changed_mm[lengths(self.changed - place) <= SPACINGS * self.spacing_mm]
 
 
-def plan_cases(count: int, seed: int) -> list[CaseSetup]:
+def plan_part_cases(count: int, seed: int) -> list[CaseSetup]:
     """The setups of cases: kinds, faults, sizes, views and clutter are equally frequent."""
     rng = np.random.default_rng(seed)
 
@@ -155,9 +155,9 @@ def _draw_case(rng: np.random.Generator, setup: CaseSetup) -> PartCase:
     tolerance = nominal.size / np.exp(rng.uniform(np.log(coarsest), np.log(1500)))
     if setup.fault in get_args(LocalFault):
         change = draw_change(rng, nominal, setup.kind, setup.fault)  # type: ignore[arg-type]
-        nominal, true = solve_change(change, setup.size * tolerance)
-    surface = Surface(nominal.build())
-    truth = Truth(nominal, true, setup.fault == "mirrored")
+        nominal, true = solve_part_change(change, setup.size * tolerance)
+    surface = PartSurface(nominal.build())
+    truth = PartTruth(nominal, true, setup.fault == "mirrored")
     if _is_symmetric(truth.surface.mesh, surface.mesh, setup.fault == "mirrored", 4 * tolerance):
         raise UnsuitedPartError("the part is symmetric")
     count = int(np.exp(rng.uniform(np.log(5000), np.log(20_000))))
@@ -197,7 +197,7 @@ def _draw_case(rng: np.random.Generator, setup: CaseSetup) -> PartCase:
     )
 
 
-class Truth:
+class PartTruth:
     """The true part, and by how much it deviates from the nominal one."""
 
     def __init__(self, nominal: Part, true: Part, is_mirrored: bool):
@@ -205,11 +205,14 @@ class Truth:
         if is_mirrored:
             for mesh in meshes:
                 mesh.apply_scale([-1, 1, 1])
-        self.surface, self._solid = map(Surface, meshes)
-        self._nominal = Surface(replace(nominal, is_open=False).build())
+        self.surface, self._solid = map(PartSurface, meshes)
+        self._nominal = PartSurface(replace(nominal, is_open=False).build())
 
     def compare(
-        self, rng: np.random.Generator, nominal: Surface, deform: Callable[[Floats], Floats] | None
+        self,
+        rng: np.random.Generator,
+        nominal: PartSurface,
+        deform: Callable[[Floats], Floats] | None,
     ) -> tuple[Floats, Floats, Floats]:
         """Of places on both surfaces: themselves (n, 3), the signed deviation (n,) mm, and the
         nearest places on the true surface (n, 3), which show it."""
@@ -230,7 +233,7 @@ def _is_symmetric(
     turns = [(1, 1, 1), (1, -1, -1), (-1, 1, -1)] if is_mirrored else []
     for turn in [(-1, -1, 1), *turns]:
         turned = trimesh.Trimesh(true.vertices * turn, true.faces, process=False)
-        if measure_size(turned, nominal) < least_mm:
+        if measure_largest_distance(turned, nominal) < least_mm:
             return True
     return False
 
@@ -258,7 +261,7 @@ def _list_monomials(p: Floats) -> Floats:
 
 
 def _solve_deformation(
-    field: Floats, points: Floats, normals: Floats, nominal: Surface, size_mm: float, rank: int
+    field: Floats, points: Floats, normals: Floats, nominal: PartSurface, size_mm: float, rank: int
 ) -> Callable[[Floats], Floats]:
     """A function that displaces points by a multiple of the field and the best rigid motion, such
     that the ``rank``-th farthest of the measured points is ``size_mm`` off the nominal."""
@@ -306,7 +309,7 @@ def scan_part(
     """Scan a part and the clutter beside it with at most ``count`` points."""
     clutter = _draw_clutter(rng, mesh, part, setup.clutter, count)
     joined: Any = trimesh.util.concatenate([mesh, *clutter])
-    scene = Surface(joined)
+    scene = PartSurface(joined)
     normals = np.asarray(scene.mesh.face_normals)
     views = [] if setup.view == "full" else _draw_views(rng, part.size, setup.view)
     if views:
@@ -337,7 +340,7 @@ def scan_part(
 
 def _scan_view(
     rng: np.random.Generator,
-    scene: Surface,
+    scene: PartSurface,
     centres: Floats,
     size: float,
     count: int,

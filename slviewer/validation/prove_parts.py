@@ -21,7 +21,7 @@ from slviewer.inspection.wrong_part import explain_misfit
 from slviewer.pipeline.operation import Progress
 from slviewer.registration.refusal import WrongPart
 from slviewer.simulation.parts import UnsuitedPartError
-from slviewer.validation.part_cases import CaseSetup, PartCase, make_case, plan_cases
+from slviewer.validation.part_cases import CaseSetup, PartCase, make_case, plan_part_cases
 from slviewer.validation.proof import BandCheck, Proof, prove_checks
 
 CASES, PROCESSES = 1200, 2
@@ -148,10 +148,10 @@ class JudgedCase:
         """The case in one line, with the expression that repeats it."""
         shown = f"{100 * self.seen:.0f} % of the fault and {self.evidence} points of it seen"
         named = f"named {', '.join(self.kinds) or 'nothing'}"
-        return f"{self.outcome}: judge_case({self.setup!r}): {shown}, {named}. {self.message}"
+        return f"{self.outcome}: judge_part_case({self.setup!r}): {shown}, {named}. {self.message}"
 
 
-def judge_case(setup: CaseSetup) -> JudgedCase | None:
+def judge_part_case(setup: CaseSetup) -> JudgedCase | None:
     """Make a case and judge it; None where no part suits its fault."""
     try:
         case = make_case(setup)
@@ -187,12 +187,12 @@ def prove_parts(scale: float, seed: int, progress: Progress) -> Proof:
 
     ``scale``: share of the cases of a full run.
     """
-    setups = plan_cases(max(1, round(scale * CASES)), seed)
+    setups = plan_part_cases(max(1, round(scale * CASES)), seed)
     cases: list[JudgedCase] = []
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(PROCESSES, spawn) as pool:
         for k, (setup, case) in enumerate(
-            zip(setups, pool.map(judge_case, setups, chunksize=4), strict=True)
+            zip(setups, pool.map(judge_part_case, setups, chunksize=4), strict=True)
         ):
             progress(k / len(setups), f"{setup.kind}, {setup.fault}")
             if case is not None:

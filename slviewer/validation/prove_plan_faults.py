@@ -24,7 +24,7 @@ from slviewer.validation.faulty_parts import (
     FaultyPart,
     Rng,
     best_fit,
-    draw_part,
+    draw_planned_part,
     fit_true,
     move_by,
     true_datum_frame,
@@ -253,11 +253,11 @@ def _list_characteristics(part: FaultyPart, alignment: str) -> Iterator[Characte
     yield Characteristic("block angle", "angle", ("block", "base"), 0, None, upper, "deg")
 
 
-def judge_part(seed: int) -> list[PlanCase]:
+def judge_planned_part(seed: int) -> list[PlanCase]:
     """Draw one part, inspect it by its plan, and compare each verdict with the truth."""
     rng = np.random.default_rng([seed, 77])
     points = int(rng.integers(5_000, 20_000))
-    part = draw_part(rng, points)
+    part = draw_planned_part(rng, points)
     t = part.tolerance_mm
     share = float(rng.choice([0.1, 1 / 3]))
     is_full = bool(rng.uniform() < 0.6)
@@ -399,7 +399,7 @@ def prove_plan_faults(scale: float, seed: int, progress: Progress) -> Proof:
     cases: list[PlanCase] = []
     for i in range(count):
         progress(i / count, f"part {i + 1} of {count}")
-        cases += judge_part(1_000_000 * seed + i)
+        cases += judge_planned_part(1_000_000 * seed + i)
     return summarize_verdicts(cases, scale)
 
 

@@ -14,13 +14,13 @@ from slviewer.inspection.wrong_part import explain_misfit
 from slviewer.records.measurement import ToleranceVerdict
 from slviewer.records.record import from_plain, to_plain
 from slviewer.registration.refusal import WrongPart
-from slviewer.simulation.parts import Feature, Part
+from slviewer.simulation.parts import Part, PartFeature
 from slviewer.surface.shapes import Mesh
 
 NOISE, TOLERANCE, PLATE = 0.02, 0.2, 5.0
-PIN = Feature((18.0, 9.0), (4.0, 4.0), 0.0, 11.0, is_round=True)
-BLOCK = Feature((-20.0, -10.0), (6.0, 4.0), 0.0, 8.0)
-HOLE = Feature((-8.0, 10.0), (3.0, 3.0), 0.0, -np.inf, is_round=True)
+PIN = PartFeature((18.0, 9.0), (4.0, 4.0), 0.0, 11.0, is_round=True)
+BLOCK = PartFeature((-20.0, -10.0), (6.0, 4.0), 0.0, 8.0)
+HOLE = PartFeature((-8.0, 10.0), (3.0, 3.0), 0.0, -np.inf, is_round=True)
 PART = Part((-30.0, 30.0), (0.0,), 20.0, PLATE, False, False, 0, (PIN, BLOCK, HOLE))
 PARTS = {
     "right": PART,

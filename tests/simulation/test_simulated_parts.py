@@ -9,17 +9,17 @@ from scipy.spatial import cKDTree
 
 from slviewer.geometry.rigid import move_points
 from slviewer.simulation.parts import (
-    Feature,
     LocalFault,
     Part,
+    PartFeature,
     PartKind,
-    Surface,
+    PartSurface,
     UnsuitedPartError,
     draw_change,
     draw_part,
-    solve_change,
+    solve_part_change,
 )
-from slviewer.validation.part_cases import CaseSetup, make_case, plan_cases
+from slviewer.validation.part_cases import CaseSetup, make_case, plan_part_cases
 
 PLATE = Part((-20.0, 20.0), (0.0,), 10.0, 5.0, False, False, 0)
 
@@ -29,7 +29,7 @@ def draw_suited(seed, kind, fault, size):
         rng = np.random.default_rng([seed, attempt])
         try:
             part = draw_part(rng, kind)
-            return part, solve_change(draw_change(rng, part, kind, fault), size * part.size)
+            return part, solve_part_change(draw_change(rng, part, kind, fault), size * part.size)
         except UnsuitedPartError:
             continue
     raise AssertionError("no part suits")
@@ -50,8 +50,8 @@ def test_parts_are_watertight_and_their_tops_open(kind) -> None:
 
 
 def test_area_and_volume_follow_from_the_features() -> None:
-    boss = Feature((-8.0, 1.0), (3.0, 2.0), 0.3, 4.0)
-    slot = Feature((6.0, 0.0), (2.0, 1.0), -0.2, -np.inf)
+    boss = PartFeature((-8.0, 1.0), (3.0, 2.0), 0.3, 4.0)
+    slot = PartFeature((6.0, 0.0), (2.0, 1.0), -0.2, -np.inf)
     mesh = PLATE.add(boss).add(slot).build()
     assert mesh.volume == pytest.approx(40 * 20 * 5 + 6 * 4 * 4 - 4 * 2 * 5)
     walls = 2 * (40 + 20) * 5 + 2 * (6 + 4) * 4 + 2 * (4 + 2) * 5
@@ -75,8 +75,8 @@ def test_local_faults_have_the_requested_size(fault) -> None:
 
 
 def test_cases_are_reproducible_and_balanced() -> None:
-    setups = plan_cases(240, seed=5)
-    assert setups == plan_cases(240, seed=5) != plan_cases(240, seed=6)
+    setups = plan_part_cases(240, seed=5)
+    assert setups == plan_part_cases(240, seed=5) != plan_part_cases(240, seed=6)
     for kind in get_args(PartKind):
         assert sum(s.kind == kind for s in setups) == 40
     one, two = make_case(setups[0]), make_case(setups[0])
@@ -87,7 +87,7 @@ def test_cases_are_reproducible_and_balanced() -> None:
 def test_points_of_right_parts_lie_on_the_nominal(view, source) -> None:
     case = make_case(CaseSetup(3, 1, "pins", "none", 0.0, view, "none", source))
     nominal = trimesh.Trimesh(*mesh_of(case))
-    _, away = Surface(nominal).closest(move_points(case.T_nominal_scan, case.points))
+    _, away = PartSurface(nominal).closest(move_points(case.T_nominal_scan, case.points))
     assert np.sqrt(np.mean(away**2)) == pytest.approx(np.median(case.sigma_mm), rel=0.15)
     assert not len(case.changed) and case.evidence == 0
     assert (case.views is None) == (source == "imported")
@@ -97,7 +97,7 @@ def test_points_of_right_parts_lie_on_the_nominal(view, source) -> None:
 def test_deformed_parts_have_the_requested_size(fault) -> None:
     case = make_case(CaseSetup(4, 2, "ribs", fault, 5.0, "full", "none", "imported"))
     nominal = trimesh.Trimesh(*mesh_of(case))
-    _, away = Surface(nominal).closest(move_points(case.T_nominal_scan, case.points))
+    _, away = PartSurface(nominal).closest(move_points(case.T_nominal_scan, case.points))
     assert np.sort(away)[-12] / case.tolerance_mm == pytest.approx(5, abs=1)
     assert case.in_view
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from slviewer.validation.part_cases import CaseSetup
-from slviewer.validation.prove_parts import JudgedCase, judge_case, summarize_parts
+from slviewer.validation.prove_parts import JudgedCase, judge_part_case, summarize_parts
 
 RIGHT = CaseSetup(0, 0, "pins", "none", 0.0, "full", "none", "imported")
 WRONG = replace(RIGHT, fault="moved", size=5.0)
@@ -41,4 +41,4 @@ def test_claim_holds_only_without_false_verdicts() -> None:
 
 @pytest.mark.computes
 def test_a_plain_case_is_judged() -> None:
-    assert judge_case(replace(RIGHT, seed=1)).verdict in ("pass", "undecided")
+    assert judge_part_case(replace(RIGHT, seed=1)).verdict in ("pass", "undecided")
