@@ -91,13 +91,12 @@ def judge_deviation(
     tolerance_mm: float,
     least_area: float = LEAST_AREA,
     common_mm: Floats | None = None,
-    reason: str = "",
 ) -> ToleranceVerdict:
     """Decide whether a part stays within plus and minus a tolerance.
 
     ``sigma_mm`` (n,): noise of the points along the surface's normal, and ``common_mm`` (n,) what
     neighbours share, from the calibration. ``least_area``: percent of the visible area that a pass
-    needs. ``reason``: why the scan does not show this part, which fails it.
+    needs.
     """
     if not tolerance_mm > 0:
         raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
@@ -109,21 +108,21 @@ def judge_deviation(
     U = COVERAGE * means.sigma
     off = np.abs(means.value)
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
-    ends = [_judge_end(means, int(end), tolerance_mm) for end in _ends(means.value)]
+    lowest, highest = (
+        _judge_end(means, int(end(means.value)), tolerance_mm) for end in (np.argmin, np.argmax)
+    )
     area = deviation.area.percent_measured() or 0.0
     spot = 2 * float(np.percentile(means.radius, 95))
     gap, gap_place = deviation.area.largest_gap
     doubts = list(_list_doubts(deviation, area, least_area, gap))
-    if places or reason:
-        decision: Decision = "fail"
-    else:
-        decision = worst_decision({ends[0][1], ends[1][1], *(["undecided"] if doubts else [])})  # type: ignore[arg-type]
+    doubtful: set[Decision] = {"undecided"} if doubts else set()
+    decision = "fail" if places else worst_decision({lowest[1], highest[1]} | doubtful)
     signed = deviation.signed[deviation.counted]
     return ToleranceVerdict(
         tolerance_mm,
         float(np.median(U)),
-        ends[0],
-        ends[1],
+        lowest,
+        highest,
         decision,
         100 * float(np.mean(np.abs(signed) <= tolerance_mm)),
         100 * float(inside.mean()),
@@ -135,8 +134,7 @@ def judge_deviation(
         spot,
         gap,
         to_vector(gap_place) if gap else None,
-        reason,
-        tuple(doubts),
+        doubts=tuple(doubts),
     )
 
 
@@ -150,10 +148,6 @@ def judge_limits(value: float, U: float, lower: float | None, upper: float | Non
     if low + U <= value <= high - U:
         return "pass"
     return "fail" if value < low - U or value > high + U else "undecided"
-
-
-def _ends(values: Floats) -> tuple[np.intp, np.intp]:
-    return np.argmin(values), np.argmax(values)
 
 
 def _judge_end(means: _Means, end: int, tolerance: float) -> tuple[float, Decision]:

@@ -41,7 +41,7 @@ from slviewer.session.ply import write_ply
 
 MAX_STORED_POINTS = 120_000
 """Points that a session keeps of a deviation, for pictures of it; the figures are of all."""
-LIKELY_COVERAGE = 0.05
+LIKELY_COVERAGE, MANY_UNMATCHED = 0.05, 0.2
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,11 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         job.warn(
             f"only {100 * result.coverage:.1f} % of {nominal.name} were measured: see that it is"
             " the same part"
+        )
+    if (share := float(result.is_unmatched.mean())) > MANY_UNMATCHED:
+        job.warn(
+            f"{100 * share:.0f} % of the points lie farther than {result.reach_mm:.3g} mm from"
+            f" {nominal.name} or face another way: see that it is the same part"
         )
     towards = np.nan_to_num(result.normals.astype(np.float64))
     verdict = None
