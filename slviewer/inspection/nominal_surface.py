@@ -366,9 +366,12 @@ def search_pose(
             f"{NOT_ALIGNED}: at most {100 * score:.0f} % of it lies on a side of the model, in any"
             " of its poses.",
         )
-    best = _improve_pose(few, few_normals, surface, sigma_mm, best)
-    _refuse_if_doubtful(best)
-    T, shape = _settle(few, few_normals, surface, best, MOST_SLACK * scan.size)
+    improved = _improve_pose(few, few_normals, surface, sigma_mm, best)
+    _refuse_if_doubtful(improved)
+    for pose in (improved, best):
+        T, shape = _settle(few, few_normals, surface, pose, MOST_SLACK * scan.size)
+        if shape is None:
+            break
     if shape is not None:
         raise Refused(
             shape,

@@ -39,7 +39,7 @@ from slviewer.records.measurement import Quantity
 from slviewer.session.inspection_plan import FORMS, SIZES, TO_DATUM, Plan, PlanFeature
 from slviewer.session.nominal import Nominal
 
-LEAST_REGION = 50.0
+LEAST_REGION = 5.0
 """Percent of a feature's area in its region that a decision needs, where no nominal model tells
 whether the feature fills the region."""
 MAX_TURNED_DEG, MAX_OFF_RADIUS = 20.0, 0.4

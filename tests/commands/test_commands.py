@@ -301,7 +301,7 @@ def test_a_calibration_made_elsewhere_reconstructs_the_same(
     status, _, error = run(
         "import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *keys
     )
-    assert (status, error) == (0, "")
+    assert status == 0 and "not checked" in error
     assert run("reconstruct", tmp_path / "other", "part", "--grid", tmp_path / "other.npy")[0] == 0
     assert (
         run(
