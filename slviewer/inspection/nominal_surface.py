@@ -3,10 +3,11 @@
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import permutations, product
+from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import (
@@ -17,12 +18,11 @@ from slviewer.geometry.rigid import (
     rigid_transform,
     turn_about,
 )
-from slviewer.geometry.robust import tukey_weights
+from slviewer.geometry.robust import robust_sigma, tukey_weights
 from slviewer.geometry.vectors import (
     box_middle,
     diagonal,
     lengths,
-    rms,
     rms_length,
     subsample,
     unit_vectors,
@@ -37,9 +37,12 @@ from slviewer.surface.shapes import Mesh, count_edges, label_connected, list_adj
 
 RIM = 0.5
 """Cosine: what the rim of an open surface faces less than this lies beyond it, not above it."""
-SETTLING = 8
+SETTLING, SETTLING_ROUNDS = 8, 2
 """Places on either side that a pose is tried at along a motion that normals leave free; then as
-many between two of them."""
+many between two of them; and how often along each of several."""
+HELD = 0.1
+"""Of the points' variance: a motion that adds more to the mean squared distance is held, as by a
+small feature."""
 CORNER = 1e-4
 """Barycentric: nearer to a side than this, the nearest place lies on it."""
 UNDAMPED = 1e-9
@@ -81,6 +84,8 @@ class NominalSurface:
         self._at_rim = np.zeros(len(vertices), bool)
         self._at_rim[half[first[triangles == 1]]] = True
         self.is_closed = not (triangles == 1).any()
+        # nothing shows such a model from behind
+        self.is_solid = bool(self._mesh.is_volume)
         self.mesh, self.vertices = mesh, vertices
         self._scene = raycasting_scene(vertices - self.middle, mesh.faces)
 
@@ -114,14 +119,17 @@ class NominalSurface:
     def signed(self, points: Floats) -> tuple[Floats, Floats]:
         """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open
         mesh; and the surface's normals (n, 3) where each is nearest."""
-        away, normals = np.empty(len(points)), np.empty((len(points), 3))
-        for k in range(0, len(points), CHUNK):  # that the caches hold
-            each = slice(k, k + CHUNK)
-            away[each], normals[each] = self._signed(points[each])
-        return away, normals
+        return self._find_nearest(points)[:2]
 
-    def _signed(self, points: Floats) -> tuple[Floats, Floats]:
-        """`signed` of fewer points."""
+    def _find_nearest(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """`signed`, and the unit normals (n, 3), at edges between those of their faces."""
+        count = range(0, max(len(points), 1), CHUNK)  # that the caches hold
+        found = [self._find_few(points[k : k + CHUNK]) for k in count]
+        away, normals, smooth = (np.concatenate(each) for each in zip(*found, strict=True))
+        return away, normals, smooth
+
+    def _find_few(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """`_find_nearest` of fewer points."""
         centred = points - self.middle
         nearest = self._scene.compute_closest_points(
             open3d().core.Tensor(centred.astype(np.float32))
@@ -144,8 +152,8 @@ class NominalSurface:
         away[is_off & at_rim & (np.abs(above) < RIM * gaps)] = np.inf
         towards = (signs / np.maximum(gaps, 1e-300))[:, None] * offsets
         is_clear = at_side & (gaps > 10 * NEGLIGIBLE)
-        normals = np.where(is_clear[:, None], towards, normals)
-        return away, normals
+        facing = np.where(at_side[:, None], smooth, normals)
+        return away, np.where(is_clear[:, None], towards, normals), facing
 
     def distances(
         self,
@@ -155,14 +163,16 @@ class NominalSurface:
         reach: float,
         *,
         either_side: bool = False,
+        at_edges: bool = False,
     ) -> tuple[Floats, Floats]:
         """Signed distances (n,) mm of a scan's points (n, 3) at ``T`` (4, 4), and the surface's
         normals (n, 3); NaN for points farther than ``reach`` mm, or whose ``normals`` (n, 3) face
-        another way than the surface, or than ``either_side`` of it."""
-        away, towards = self.signed(move_points(T, points))
+        another way than the surface, or than ``either_side`` of it. ``at_edges``: those that face
+        as the faces of an edge belong to it, which draws them from beyond."""
+        away, towards, facing = self._find_nearest(move_points(T, points))
         belongs = np.abs(away) <= reach
         if normals is not None:
-            cosine = np.sum((normals @ T[:3, :3].T) * towards, axis=1)
+            cosine = ((normals @ T[:3, :3].T) * (facing if at_edges else towards)).sum(axis=1)
             # an unknown normal excludes nothing
             belongs &= ~((np.abs(cosine) if either_side else cosine) < MIN_NORMAL_COSINE)
         away[~belongs] = np.nan
@@ -209,6 +219,9 @@ MAX_POINTS, FITTED_POINTS = 40_000, 3_000
 """Points of a scan in the coarse search, and in the fits from there."""
 MIN_VISIBLE = 2_000
 MIN_COUNTED = 100
+RACED_POINTS, RACED_ITERATIONS, FINALISTS, LOSING = 300, 3, 3, 2.0
+"""Of a scan by which many poses are fitted roughly; and how many of these, of costs up to so many
+times the least, are then fitted by more points."""
 REACH = 0.02
 """Of the nominal's diagonal: scan points farther from it do not count in the best fit."""
 GOOD_ERROR = 0.002
@@ -218,9 +231,9 @@ EXACT_AGREEMENT = 0.995
 GOOD_OVERLAP, GOOD_AGREEMENT, NEAR = 0.6, 0.95, 5.0
 """Shares of the scan, and of its points within so many reaches of the nominal, that fit well: no
 better pose is searched for."""
-PATIENCE, BETTER_COST = 8, 0.95
-"""Sides searched without a pose of so much lower cost, after a likely one whose points do not all
-fit well: a part with an error has no better one."""
+PATIENCE, MOST_PATIENCE, BETTER_COST = 2, 8, 0.95
+"""Sides searched without a pose of so much lower cost, after one whose points do not all fit well:
+a part with an error has no better one; more where hardly half of them fit."""
 LEAST_SCORE = 0.1
 """Share of the scan that must lie on the nominal after the coarse search: from there on a pose is
 fitted. The part itself reaches 0.5 and more, other parts below 0.15."""
@@ -233,18 +246,15 @@ VIEWS = [
 ]
 """From where a model is looked at: its sides, from below and above first, then its edges, then its
 corners."""
-TURNED_POINTS, TURN_ROUNDS = 1_000, 3
+TURNED_POINTS, TURN_ROUNDS = 1_000, 8
 RIVAL_SHARE = 0.6
 """Of the points that lie near the model: so many do at a turned pose that is tried."""
-NUDGES_DEG, NUDGED = (-4.0, -1.0, 1.0, 4.0), 3
-"""How far, and how many of the best turned poses, are turned on."""
-RIGHT_TURNS = [
-    sign[:, None] * np.eye(3)[list(order)]
-    for order in permutations(range(3))
-    for sign in map(np.array, product((-1.0, 1.0), repeat=3))
-    if np.linalg.det(sign[:, None] * np.eye(3)[list(order)]) > 0
-][1:]
-"""The rotations (3, 3) of a cube but for none."""
+RIVALS = 24
+"""Turned and shifted poses that are tried."""
+NUDGES_DEG, NUDGED = (-3.0, 3.0), 3
+"""How far, and how many of the best of these, are turned on."""
+RIGHT_TURNS = Rotation.create_group("O").as_matrix()
+"""The rotations (24, 3, 3) of a cube, which none is among."""
 MIN_FACING_COSINE = 0.1
 AWAY = 3.0
 """Diagonals: from so far."""
@@ -255,9 +265,10 @@ class NominalPose:
     """A scan's pose ``T`` (4, 4) mm, T_nominal_scan, on a nominal model.
 
     ``cost``: mean of the points' squared distances over that of the reach, each at most 1, and up
-    to twice as large where they show the surface from behind. ``overlap``: share of the scan on the
-    nominal; ``agreement``: share of these among the points that face it nearby. ``is_good``: nearly
-    all points fit well, ``is_exact``: all but a few. ``gate_mm``: distance of the points on it.
+    to twice as large where they show the surface from behind; 1 there on a solid. ``overlap``:
+    share of the scan on the nominal; ``agreement``: share of these among the points that face it
+    nearby. ``is_good``: nearly all points fit well, ``is_exact``: all but a few. ``gate_mm``:
+    distance of the points on it.
     """
 
     T: Floats
@@ -282,19 +293,23 @@ def fit_pose(
     reach: float,
     robust: bool = False,
     report: Progress = lambda share: None,
+    iterations: int | None = None,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Fit the pose of least squared distances of the points that belong to the nominal, by
     Gauss-Newton, damped where a step does not reduce their capped mean, as along a face that slides
-    on itself; ``robust``: by fewer iterations, with Tukey's weights, on either side of it.
+    on itself; ``robust``: by fewer ``iterations``, with Tukey's weights, on either side of it.
 
     Returns T (4, 4), and of the points in the last iteration their places (k, 3), the Jacobian
     (k, 6) about the mean of these, and distances (k,) mm. Raises InputError for too few.
     """
-    trial, iterations = np.array(T, np.float64), FEW_ITERATIONS if robust else MAX_ITERATIONS
+    trial = np.array(T, np.float64)
+    iterations = iterations or (FEW_ITERATIONS if robust else MAX_ITERATIONS)
     damping, least = UNDAMPED, np.inf
     for turn in range(iterations):
         report(turn / iterations)
-        off, towards = surface.distances(points, normals, trial, reach, either_side=robust)
+        off, towards = surface.distances(
+            points, normals, trial, reach, either_side=robust, at_edges=robust
+        )
         counted, cost = np.isfinite(off), float(np.mean(_cap(off / reach)))
         if cost >= least and not robust:  # nothing held the step
             damping *= 100
@@ -341,8 +356,9 @@ def search_pose(
     points = subsample(points, MAX_POINTS)
     normals = None if normals is None else subsample(normals, MAX_POINTS)
     scan = prepare_scan("scan", points, normals, sigma_mm, has_camera)
-    few = subsample(points, FITTED_POINTS)
+    few, some = subsample(points, FITTED_POINTS), subsample(points, TURNED_POINTS)
     few_normals = None if normals is None else subsample(normals, FITTED_POINTS)
+    own = None if normals is None else subsample(normals, TURNED_POINTS)
     best: NominalPose | None = None
     score, in_vain = 0.0, 0
     for side, camera in _list_sides(surface, has_camera, views, report):
@@ -353,12 +369,12 @@ def search_pose(
             for start in starts
             if start.score >= LEAST_SCORE
         ]
-        before, best = best, _choose_pose(few, few_normals, surface, sigma_mm, poses, best)
-        if best is None:
+        found = _choose_pose(some, own, surface, sigma_mm, poses, best)
+        if found is None:
             continue
-        if before is None or best.cost < BETTER_COST * before.cost:
-            in_vain = 0
-        if best.is_good or (best.is_likely and in_vain >= (PATIENCE if has_camera else 2)):
+        if best is None or found.cost < BETTER_COST * best.cost:
+            best, in_vain = _improve_pose(some, own, surface, sigma_mm, found), 0
+        if best.is_good or in_vain >= (PATIENCE if best.overlap >= GOOD_OVERLAP else MOST_PATIENCE):
             break
     if best is None:
         raise Refused(
@@ -366,12 +382,9 @@ def search_pose(
             f"{NOT_ALIGNED}: at most {100 * score:.0f} % of it lies on a side of the model, in any"
             " of its poses.",
         )
-    improved = _improve_pose(few, few_normals, surface, sigma_mm, best)
-    _refuse_if_doubtful(improved)
-    for pose in (improved, best):
-        T, shape = _settle(few, few_normals, surface, pose, MOST_SLACK * scan.size)
-        if shape is None:
-            break
+    best = _fit_start(few, few_normals, surface, best.T, sigma_mm)
+    _refuse_if_doubtful(best)
+    T, shape = _settle(few, few_normals, surface, best, MOST_SLACK * scan.size)
     if shape is not None:
         raise Refused(
             shape,
@@ -390,10 +403,20 @@ def _choose_pose(
     starts: Sequence[Floats],
     best: NominalPose | None,
 ) -> NominalPose | None:
-    """Return the pose of least cost, ``best`` or one fitted from ``starts`` (4, 4)."""
+    """Return the pose of least cost, ``best`` or one fitted from ``starts`` (4, 4), of which those
+    that a few of the points fit best are tried."""
+    some = subsample(points, RACED_POINTS)
+    own = None if normals is None else subsample(normals, RACED_POINTS)
+    raced = list[NominalPose]()
     for T in starts:
         with suppress(InputError):  # hardly any of it lies there
-            pose = _fit_start(points, normals, surface, T, sigma_mm)
+            raced.append(_fit_start(some, own, surface, T, sigma_mm, is_rough=True))
+    raced.sort(key=lambda pose: pose.cost)
+    for rough in raced[:FINALISTS]:
+        if rough.cost > LOSING * min(raced[0].cost, np.inf if best is None else best.cost):
+            break
+        with suppress(InputError):
+            pose = _fit_start(points, normals, surface, rough.T, sigma_mm)
             if best is None or pose.cost < best.cost:
                 best = pose
     return best
@@ -409,19 +432,12 @@ def _improve_pose(
     """Return the pose of least cost among those turned by right angles about the model's main axes,
     as a plate fits in four ways but for its small features; and where no pose is good, by a few
     degrees from there."""
-    some = subsample(points, TURNED_POINTS)
-    own = None if normals is None else subsample(normals, TURNED_POINTS)
     for _ in range(TURN_ROUNDS):
-        starts = _list_turned(some, own, surface, pose)
-        with suppress(InputError):
-            now = _fit_start(some, own, surface, pose.T, sigma_mm)
-            other = _choose_pose(some, own, surface, sigma_mm, starts, now) or now
-            if other.cost < BETTER_COST * now.cost:
-                better = _fit_start(points, normals, surface, other.T, sigma_mm)
-                if better.cost < pose.cost:
-                    pose = better
-                    continue
-        break
+        starts = _list_turned(points, normals, surface, pose)
+        other = _choose_pose(points, normals, surface, sigma_mm, starts, pose) or pose
+        if other.cost > BETTER_COST * pose.cost:
+            break
+        pose = other
     return pose
 
 
@@ -429,14 +445,20 @@ def _list_turned(
     points: Floats, normals: Floats | None, surface: NominalSurface, pose: NominalPose
 ) -> list[Floats]:
     """Return poses (4, 4) at which nearly as much of a scan lies near the model: turned by right
-    angles, and on by a few degrees where the ``pose`` is not exact."""
+    angles, and moved to where its ends meet; and on by a few degrees where the ``pose`` is not
+    exact."""
+    some = subsample(points, RACED_POINTS)
+    own = None if normals is None else subsample(normals, RACED_POINTS)
     axes, middle = surface.main_axes()
     turns = [axes @ R @ axes.T for R in RIGHT_TURNS]
     tried = [pose.T]
-    for T in [rigid_transform(R, middle - R @ middle) @ pose.T for R in turns]:
-        tried += _shift_flat(points, surface, axes, T)
-    shares = [_share_on(points, normals, surface, T) for T in tried]
-    order = [k for k in np.argsort(shares)[::-1] if shares[k] >= RIVAL_SHARE * shares[0]]
+    for R in turns:
+        tried += _list_shifted(
+            some, surface, axes, rigid_transform(R, middle - R @ middle) @ pose.T
+        )
+    shares = [_share_on(some, own, surface, T) for T in tried]
+    best = np.argsort(shares)[::-1][:RIVALS]
+    order = [k for k in best if shares[k] >= RIVAL_SHARE * shares[0]]
     starts = [tried[k] for k in order if k]
     if pose.is_exact:
         return starts
@@ -444,15 +466,20 @@ def _list_turned(
     return starts + [nudge @ tried[k] for k in order[:NUDGED] for nudge in nudges]
 
 
-def _shift_flat(points: Floats, surface: NominalSurface, axes: Floats, T: Floats) -> list[Floats]:
-    """Return a pose (4, 4) as it is, and shifted along the model's shortest side so that the upper
-    or the lower ends of scan and model meet: turned over, a plate lies elsewhere."""
-    model = surface.vertices @ axes
-    short = int(np.argmin(np.ptp(model, axis=0)))
-    ends = np.percentile(move_points(T, points) @ axes[:, short], [1, 99])
-    shifts = np.array([model[:, short].min(), model[:, short].max()]) - ends
-    moves = [rigid_transform(np.eye(3), shift * axes[:, short]) for shift in shifts]
-    return [T, *(move @ T for move in moves)]
+def _list_shifted(points: Floats, surface: NominalSurface, axes: Floats, T: Floats) -> list[Floats]:
+    """Return a pose (4, 4) as it is, and shifted along each of the model's axes so that the lower
+    or the upper ends of scan and model meet: turned over, a plate lies elsewhere."""
+    scan, model = move_points(T, points) @ axes, surface.vertices @ axes
+    ends = np.percentile(scan, [1, 99], axis=0)
+    shifts = np.stack([model.min(axis=0), model.max(axis=0)]) - ends
+    return [
+        T,
+        *(
+            rigid_transform(np.eye(3), s * a) @ T
+            for row in shifts
+            for s, a in zip(row, axes.T, strict=True)
+        ),
+    ]
 
 
 def improve_pose(
@@ -463,9 +490,11 @@ def improve_pose(
     T: Floats,
 ) -> Floats:
     """Return the pose (4, 4) of least cost about ``T`` (4, 4) and its right turns."""
-    few = subsample(points, FITTED_POINTS)
-    own = None if normals is None else subsample(normals, FITTED_POINTS)
-    return _improve_pose(few, own, surface, sigma_mm, _fit_start(few, own, surface, T, sigma_mm)).T
+    some = subsample(points, TURNED_POINTS)
+    own = None if normals is None else subsample(normals, TURNED_POINTS)
+    return _improve_pose(
+        some, own, surface, sigma_mm, _fit_start(some, own, surface, T, sigma_mm)
+    ).T
 
 
 def _share_on(points: Floats, normals: Floats | None, surface: NominalSurface, T: Floats) -> float:
@@ -486,8 +515,10 @@ def _list_sides(
         report(turn / len(views))
         towards = np.where(facing @ view < 0, -1.0, 1.0)[:, None] * facing
         visible = surface.seen_from(places, towards, view, MIN_FACING_COSINE)
-        if np.count_nonzero(visible) >= MIN_VISIBLE:
-            camera = surface.middle + AWAY * surface.diagonal * view
+        if np.count_nonzero(visible) < MIN_VISIBLE:
+            continue
+        camera = surface.middle + AWAY * surface.diagonal * view
+        with suppress(InputError):  # all of a thin model is seen at grazing angles
             yield prepare_scan("nominal model", places[visible] - camera, towards[visible]), camera
 
 
@@ -503,20 +534,44 @@ def _fit_start(
     surface: NominalSurface,
     T: Floats,
     sigma_mm: float | None,
+    is_rough: bool = False,
 ) -> NominalPose:
-    """Fit the pose of points (n, 3) from ``T`` (4, 4), coarse to fine, and judge it; InputError
-    where they do not lie on the nominal."""
+    """Fit the pose of points (n, 3) from ``T`` (4, 4), coarse to fine, and judge it: the better of
+    both; ``is_rough``: by few iterations. InputError where they do not lie on the nominal."""
+    reach = REACH * surface.diagonal
+    gate = max(reach / 3, 3 * (sigma_mm or 0.0))
+    widths = [3 * gate + 2 * reach, 2 * gate, gate]
+    if is_rough:
+        for within in widths:
+            T = fit_pose(points, normals, surface, T, within, True, iterations=RACED_ITERATIONS)[0]
+        return _judge_pose(points, normals, surface, T, sigma_mm)
+    given = _judge_pose(points, normals, surface, T, sigma_mm)
+    for within in widths[1:] if given.is_likely else widths:
+        T = fit_pose(points, normals, surface, T, within, robust=True)[0]
+    fitted = _judge_pose(points, normals, surface, T, sigma_mm)
+    return min(fitted, given, key=lambda pose: pose.cost)
+
+
+def _judge_pose(
+    points: Floats,
+    normals: Floats | None,
+    surface: NominalSurface,
+    T: Floats,
+    sigma_mm: float | None,
+) -> NominalPose:
+    """Judge how well points (n, 3) fit at a pose ``T`` (4, 4)."""
     sigma, reach = sigma_mm or 0.0, REACH * surface.diagonal
     gate, good = max(reach / 3, 3 * sigma), max(GOOD_ERROR * surface.diagonal, 3 * sigma)
-    for within in (3 * gate + 2 * reach, 2 * gate, gate):
-        T = fit_pose(points, normals, surface, T, within, robust=True)[0]
-    near = np.abs(surface.signed(move_points(T, points))[0]) < NEAR * reach
-    off = np.abs(surface.distances(points, normals, T, 4 * gate, either_side=True)[0])
-    fitting = np.sum(off <= good)
-    behind = np.sum(off < gate) - np.isfinite(surface.distances(points, normals, T, gate)[0]).sum()
+    away, towards = surface.signed(move_points(T, points))
+    cosine = np.ones(len(points)) if normals is None else ((normals @ T[:3, :3].T) * towards).sum(1)
+    near = np.abs(away) < NEAR * reach
+    faces = ~(np.abs(cosine) < MIN_NORMAL_COSINE)  # an unknown normal excludes nothing
+    off = np.where(faces & (np.abs(away) <= 4 * gate), np.abs(away), np.nan)
+    behind = float(np.mean((off <= gate) & (cosine < MIN_NORMAL_COSINE)))
+    fitting, cost = np.sum(off <= good), float(np.mean(_cap(off / reach)))
     return NominalPose(
         T,
-        cost=(1 + behind / len(points)) * float(np.mean(_cap(off / reach))),
+        cost=cost + behind * (1 if surface.is_solid else cost),
         overlap=float(np.mean(off <= gate)),
         agreement=float(np.sum(off <= gate) / max(1, np.isfinite(off).sum())),
         is_good=bool(fitting >= max(GOOD_OVERLAP * len(points), GOOD_AGREEMENT * np.sum(near))),
@@ -548,17 +603,19 @@ def _settle(
     middle = moved.mean(axis=0)
     radius = rms_length(moved - middle)
     J = J / np.repeat([radius, 1.0], 3)
-    error = rms(away)
+    error = max(robust_sigma(away, about=0.0), NEGLIGIBLE)
     freedom = freedom_of(J.T @ J / len(J), error)
     slack, T = freedom.slack_mm.copy(), pose.T
-    for k in np.flatnonzero(slack > most / 2):
-        turn, shift = most * freedom.motions[k, :3] / radius, most * freedom.motions[k, 3:]
+    free = np.flatnonzero(slack > most / 2)
+    steps = [(most * m[:3] / radius, most * m[3:]) for m in freedom.motions[free]]
+    for turn, shift in SETTLING_ROUNDS * steps if len(steps) > 1 else steps:
         shares = np.linspace(-1, 1, 2 * SETTLING + 1)
         for width in (1.0, 1 / SETTLING):
             moves = [turn_about(w * turn, middle, w * shift) @ T for w in width * shares]
             T = min(moves, key=mean_square)
+    for k, (turn, shift) in zip(free, steps, strict=True):
         ends = (turn_about(sign * turn, middle, sign * shift) @ T for sign in (1, -1))
-        if min(mean_square(end) for end in ends) > mean_square(T) + error**2:
+        if min(mean_square(end) for end in ends) > mean_square(T) + HELD * error**2:
             slack[k] = 0.0
     return T, Freedom(np.sort(slack), freedom.motions[np.argsort(slack)]).shape(most)
 

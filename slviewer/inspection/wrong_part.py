@@ -7,10 +7,16 @@ from contextlib import suppress
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Floats, distance_jacobian, move_points, turn_about
+from slviewer.geometry.rigid import (
+    Floats,
+    distance_jacobian,
+    move_points,
+    rigid_transform,
+    turn_about,
+)
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 from slviewer.geometry.vectors import diagonal, rms_length, subsample, unit_vectors
-from slviewer.inspection.nominal_surface import VIEWS, NominalSurface, search_pose
+from slviewer.inspection.nominal_surface import VIEWS, NominalSurface, improve_pose, search_pose
 from slviewer.registration.refusal import Refused
 from slviewer.surface.shapes import Mesh
 
@@ -77,8 +83,18 @@ def explain_misfit(
     for words, mesh, factor in _list_others(nominal, points, surface.diagonal):
         other, near = NominalSurface(mesh), factor * near_mm
         with suppress(Refused, InputError):
-            pose = search_pose(points, normals, other, near / 4, _ignore, has_camera, views)
-            share = _share_off(points, normals, other, _refit(points, normals, other, pose), near)
+            share = 1.0
+            if T is not None:  # whose outline is the model's
+                start = rigid_transform(np.eye(3), other.middle - surface.middle) @ T
+                pose = improve_pose(points, normals, other, near / 4, start)
+                share = _share_off(
+                    points, normals, other, _refit(points, normals, other, pose), near
+                )
+            if share >= most and off > MOST_OFF:
+                pose = search_pose(points, normals, other, near / 4, _ignore, has_camera, views)
+                share = _share_off(
+                    points, normals, other, _refit(points, normals, other, pose), near
+                )
             if share < most:
                 return (
                     f"the scan fits {words} ({100 * (1 - share):.0f} % of its points lie within"

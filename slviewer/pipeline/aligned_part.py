@@ -39,9 +39,9 @@ from slviewer.records.measurement import Quantity
 from slviewer.session.inspection_plan import FORMS, SIZES, TO_DATUM, Plan, PlanFeature
 from slviewer.session.nominal import Nominal
 
-LEAST_REGION = 5.0
-"""Percent of a feature's area in its region that a decision needs, where no nominal model tells
-whether the feature fills the region."""
+LEAST_FILLED = 50.0
+"""Percent of a feature's area in its region that a decision needs, where neither a nominal model
+nor the plan tells how much of the region a whole part fills."""
 MAX_TURNED_DEG, MAX_OFF_RADIUS = 20.0, 0.4
 """From the plan's direction, and from its place or radius as a share of that: a feature farther off
 is another."""
@@ -101,6 +101,7 @@ class AlignedPart:
         self.points = move_points(self.T_part_scan, self._scan_points)
         self.feature: Callable[[str], FeatureFit] = cache(self._fit)
         self.surface: Callable[[str], SurfacePoints] = cache(self._surface_points)
+        self.percent_measured: Callable[[str], float | None] = cache(self._percent_measured)
 
     def profile(self, name: str) -> Quantity:
         """The profile of a region against the nominal model. Raises InputError without a model."""
@@ -163,7 +164,7 @@ class AlignedPart:
         found = [warning for name in fitted for warning in self.feature(name).warnings]
         return [*self.errors.warnings, *dict.fromkeys(found)]
 
-    def percent_measured(self, name: str) -> float | None:
+    def _percent_measured(self, name: str) -> float | None:
         """Percent of a feature's area that the scan's views can see and was measured; None where
         that is not known."""
         feature, T = self.features[name], self.T_part_scan
@@ -175,10 +176,26 @@ class AlignedPart:
         fit = self.feature(name)
         return percent_measured(fit.feature, feature.region, fit.points, views)
 
-    def area_needed(self, min_area: float) -> float:
-        """Percent of a feature's area that has to be measured: ``min_area`` of the nominal model's,
-        and where only the region tells how far the feature reaches, `LEAST_REGION`."""
-        return min(min_area, LEAST_REGION) if self._area is None else min_area
+    def explain_lack(self, name: str, min_area: float) -> str:
+        """Why too little of a feature's area was measured for a decision; empty where enough was:
+        ``min_area`` percent of what the nominal model has of it in its region, or the plan's own
+        part."""
+        measured, filled, needed = self.percent_measured(name), self.features[name].filled, min_area
+        more = ""
+        if self._area is None and filled is not None:
+            needed = min_area * filled / 100
+        elif self._area is None:
+            needed = min(min_area, LEAST_FILLED)
+            more = (
+                "; if its region is larger than the feature, state in the plan what percent of it"
+            )
+            more += " a whole part fills, as filled"
+        if measured is None or measured >= needed:
+            return ""
+        return (
+            f"{measured:.1f} % of the area of {name} that the views can see was measured, and"
+            f" {needed:.3g} % are needed: scan what is missing and merge{more}"
+        )
 
     @property
     def errors(self) -> PointErrors:
@@ -264,14 +281,10 @@ def judge_characteristic(
         return _mark_undecided(wanted, "its uncertainty is not known")
     decision = judge_limits(value, U, wanted.lower, wanted.upper)
     doubts, evidence = part.doubts(wanted.features), part.evidence(wanted.features)
-    needed = part.area_needed(min_area)
-    if evidence.measured is not None and evidence.measured < needed:
+    lacking = [text for name in wanted.features if (text := part.explain_lack(name, min_area))]
+    if lacking:
         decision = "undecided"
-        doubts.append(
-            f"{evidence.measured:.1f} % of the area of {' or '.join(wanted.features)} that the"
-            f" views can see was measured, and {needed:g} % are needed: scan what is missing and"
-            " merge"
-        )
+        doubts += lacking
     is_zone = wanted.kind in (*FORMS, *TO_DATUM, "profile", "position")
     if is_zone and decision == "pass" and evidence.smallest > (wanted.upper or np.inf):
         decision = "undecided"

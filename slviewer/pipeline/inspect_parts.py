@@ -353,6 +353,8 @@ def make_plan(
     fits = _select_fits(measured, job.warn)
     features = {identity: load_feature(job.store, each)[0] for identity, each in fits.items()}
     names, T, alignment = _distinct_names(fits), np.eye(4), Alignment()
+    own = next(iter(fits.values())).record
+    surface = load_surface(job, own.source, own.model)
     if datums:
         if missing := [each for each in datums if each not in fits]:
             raise InputError(
@@ -362,8 +364,7 @@ def make_plan(
         start = tuple(map(tuple, T.round(9).tolist()))
         alignment = Alignment("3-2-1", None, tuple(names[each] for each in datums), start)  # type: ignore[arg-type]
     elif nominal is not None:
-        ideal, source = read_nominal(nominal), next(iter(fits.values())).record
-        T = fit_to_nominal(load_surface(job, source.source, source.model), ideal).T_nominal_scan
+        T = fit_to_nominal(surface, read_nominal(nominal)).T_nominal_scan
         alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
     if skipped := [
         each.label
@@ -374,12 +375,21 @@ def make_plan(
             f"a plan holds fits and their relations that are not stale: {', '.join(skipped)} are"
             " not in it"
         )
-    return Plan(
+    plan = Plan(
         name,
         tuple(_plan_feature(names[i], each, features[i], T) for i, each in fits.items()),
         tuple(_list_characteristics(measured, names, tolerance)),
         alignment,
     )
+    return plan if alignment.nominal else _state_filled(plan, surface)
+
+
+def _state_filled(plan: Plan, surface: MeasuredSurface) -> Plan:
+    """Return a plan that states how much of their regions the features of its own part fill."""
+    part = AlignedPart(plan, surface, None)
+    filled = {each.name: part.percent_measured(each.name) for each in plan.feature}
+    features = (replace(f, filled=round(filled[f.name] or 0, 1) or None) for f in plan.feature)
+    return replace(plan, feature=tuple(features))
 
 
 def _select_fits(

@@ -36,7 +36,8 @@ KINDS: dict[str, int] = {
 class PlanFeature:
     """A feature to fit: its ``kind`` in a ``region``; ``place``, ``direction`` and ``radius``:
     nominal, in part coordinates, for positions. A ``surface`` is compared with the nominal
-    model."""
+    model. ``filled``: percent of the feature's area in the region, if it went on, that a whole part
+    has."""
 
     name: str
     kind: Literal["plane", "sphere", "cylinder", "surface"]
@@ -44,6 +45,11 @@ class PlanFeature:
     place: Vector | None = None
     direction: Vector | None = None
     radius: float | None = None
+    filled: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.filled is not None and not 0 < self.filled <= 100:
+            raise ValueError(f"filled is {self.filled:g}: give 0 to 100, in percent")
 
     def nominal(self) -> Feature:
         """The nominal feature. Raises InputError where the plan does not give it."""

@@ -19,6 +19,7 @@ from slviewer.geometry.rigid import (
     turn_about,
 )
 from slviewer.geometry.vectors import lengths, median_spacing, unit_vectors
+from slviewer.inspection.exclusion import label_clusters
 from slviewer.simulation.parts import (
     LocalFault,
     Part,
@@ -45,12 +46,14 @@ MAX_ATTEMPTS = 100
 MIN_COSINE = 0.2
 """Of the angle of incidence at which a camera measures."""
 MIN_SEEN, MIN_EVIDENCE, MIN_SIGMAS = 0.2, 6, 3.0
-"""Share of the faulty region, points that deviate by more than the tolerance, and standard
-deviations of their mean by which they exceed it, without which a fault is not in view."""
+"""Share of the faulty region, points in one place that deviate by more than the tolerance, and
+standard deviations by which the mean of some of them exceeds it, without which a fault is not in
+view."""
 MIN_SHOWN = 0.2
 """Of a deformation, over its largest displacement, what the measured points have to deviate by."""
 SPACINGS = 3.0
 """From a place to the nearest one that was measured, or that changed."""
+EYE = np.eye(4)
 TOUCHING = 1e-4
 """Distance of what touches, over the part's size."""
 
@@ -80,10 +83,9 @@ class PartCase:
 
     ``points``, ``normals`` (n, 3) in the scan's frame; ``sigma_mm`` (n,) their noise along the
     normals. ``views``: centres (2, 3) of camera and projector of each view; None if unknown.
-    ``changed`` (k, 3): places in the nominal's frame, on the true or the nominal surface, where
-    these differ, and ``changed_mm`` (k,) by how much, positive for too much material. ``seen``:
-    share of the faulty region that has scan points; ``evidence``: number of scan points that
-    deviate by more than the tolerance. ``spacing_mm`` of the points.
+    ``measured`` (m, 3): the part's points without noise, in the nominal's frame at the part's true
+    pose ``T_nominal_scan``. ``seen``: share of the faulty region that has scan points.
+    ``spacing_mm`` of the points.
     """
 
     setup: CaseSetup
@@ -94,22 +96,60 @@ class PartCase:
     views: list[Floats] | None
     tolerance_mm: float
     T_nominal_scan: Floats
-    changed: Floats
-    changed_mm: Floats
+    measured: Floats
+    truth: "PartTruth"
     seen: float
-    evidence: int
     spacing_mm: float
+
+    def placed_at(self, T_nominal_scan: Floats) -> "PlacedPart":
+        """The part as it deviates at a pose (4, 4)."""
+        T = T_nominal_scan @ np.linalg.inv(self.T_nominal_scan)
+        places, deviations, _ = self.truth.compare(np.random.default_rng(self.setup.index), T)
+        measured = move_points(T, self.measured)
+        off, is_inside = self.truth.measure(measured)
+        excess, link, shown = off - self.tolerance_mm, SPACINGS * self.spacing_mm, []
+        for side in (is_inside, ~is_inside):
+            own = np.flatnonzero(side & (excess > 0))
+            shown += [excess[own[each]] for each in label_clusters(measured[own], link)]
+        return PlacedPart(self, places, deviations, shown)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPart:
+    """A part at a pose: ``places`` (k, 3) in the nominal's frame, all over the true surface and the
+    nominal one, and their ``deviations`` (k,) mm, positive for too much material; and of each
+    cluster of measured points that are out of tolerance by how much, ``excess_mm``."""
+
+    case: PartCase
+    places: Floats
+    deviations: Floats
+    excess_mm: Sequence[Floats]
+
+    @property
+    def evidence(self) -> int:
+        """Number of measured points that deviate by more than the tolerance."""
+        return sum(map(len, self.excess_mm))
 
     @property
     def in_view(self) -> bool:
-        """Whether the scan shows the fault, and noise does not hide it."""
-        share = float(np.median(self.sigma_mm)) / self.tolerance_mm
-        needed = (MIN_SIGMAS * share / max(self.setup.size - 1, 1e-3)) ** 2
-        return self.seen >= MIN_SEEN and self.evidence >= max(MIN_EVIDENCE, needed)
+        """Whether the scan shows that the part is wrong, and noise does not hide it."""
+        sigma = float(np.median(self.case.sigma_mm))
+        best = 0.0
+        for excess in self.excess_mm:
+            sums, counts = np.cumsum(np.sort(excess)[::-1]), np.arange(1, len(excess) + 1)
+            best = max(best, *(sums / np.sqrt(counts) / sigma)[MIN_EVIDENCE - 1 :], 0.0)
+        return self.case.seen >= MIN_SEEN and best >= MIN_SIGMAS
 
-    def changed_near(self, place: Floats) -> Floats:
-        """The deviations (m,) mm of the changed places within a few spacings of one (3,)."""
-        return self.changed_mm[lengths(self.changed - place) <= SPACINGS * self.spacing_mm]
+    @property
+    def conforms(self) -> bool:
+        """Whether all of the part lies within the tolerance here."""
+        return float(np.abs(self.deviations).max()) <= self.case.tolerance_mm
+
+    def deviations_near(self, place: Floats, sign: float) -> Floats:
+        """The deviations (m,) mm of such a sign, out of tolerance, within a few spacings of a place
+        (3,)."""
+        is_near = lengths(self.places - place) <= SPACINGS * self.case.spacing_mm
+        return self.deviations[is_near & (sign * self.deviations > self.case.tolerance_mm)]
 
 
 def plan_part_cases(count: int, seed: int) -> list[CaseSetup]:
@@ -156,13 +196,13 @@ def _draw_case(rng: np.random.Generator, setup: CaseSetup) -> PartCase:
     if setup.fault in get_args(LocalFault):
         change = draw_change(rng, nominal, setup.kind, setup.fault)  # type: ignore[arg-type]
         nominal, true = solve_part_change(change, setup.size * tolerance)
-    surface = PartSurface(nominal.build())
     truth = PartTruth(nominal, true, setup.fault == "mirrored")
+    surface = truth.nominal
     if _is_symmetric(truth.surface.mesh, surface.mesh, setup.fault == "mirrored", 4 * tolerance):
         raise UnsuitedPartError("the part is symmetric")
     count = int(np.exp(rng.uniform(np.log(5000), np.log(20_000))))
     scan = scan_part(rng, truth.surface.mesh, nominal, setup, count)
-    is_part, deform = scan.is_part, None
+    is_part = scan.is_part
     measured = scan.points[is_part], scan.normals[is_part]
     if setup.fault in get_args(GlobalFault):
         field = _draw_deformation(rng, setup.fault, nominal)
@@ -170,12 +210,11 @@ def _draw_case(rng: np.random.Generator, setup: CaseSetup) -> PartCase:
         deform = _solve_deformation(field, *measured, surface, setup.size * tolerance, rank)
         measured = deform(measured[0]), _deform_normals(deform, *measured, tolerance)
         scan.points[is_part], scan.normals[is_part] = measured
-    places, signed, showing = truth.compare(rng, surface, deform)
+        truth.deform = deform
+    _, signed, showing = truth.compare(rng)
     tree = cKDTree(measured[0])
     spacing = median_spacing(tree, 2000)
-    off = np.abs(signed)
-    is_changed = (off > 0.25 * off.max()) & (setup.fault != "none")
-    shown = tree.query(showing[off > tolerance])[0] < SPACINGS * spacing
+    shown = tree.query(showing[np.abs(signed) > tolerance])[0] < SPACINGS * spacing
     T_scan_nominal = _draw_pose(rng, nominal.size, scan.views)
     sigma = tolerance / rng.choice([3, 10])
     points, normals = _add_noise(rng, scan, sigma, setup.clutter == "spikes", nominal.size)
@@ -189,16 +228,16 @@ def _draw_case(rng: np.random.Generator, setup: CaseSetup) -> PartCase:
         views if setup.source == "own" else None,
         float(tolerance),
         np.linalg.inv(T_scan_nominal).astype(np.float64),
-        places[is_changed],
-        signed[is_changed],
+        measured[0],
+        truth,
         float(shown.mean()) if len(shown) else 1.0,
-        int((surface.closest(measured[0])[1] > tolerance).sum()),
         spacing,
     )
 
 
 class PartTruth:
-    """The true part, and by how much it deviates from the nominal one."""
+    """The true part, and by how much it deviates from the ``nominal`` one. ``deform``: displaces
+    points (n, 3) of the true part further."""
 
     def __init__(self, nominal: Part, true: Part, is_mirrored: bool):
         meshes = [replace(true, is_open=is_open).build() for is_open in (true.is_open, False)]
@@ -206,24 +245,27 @@ class PartTruth:
             for mesh in meshes:
                 mesh.apply_scale([-1, 1, 1])
         self.surface, self._solid = map(PartSurface, meshes)
-        self._nominal = PartSurface(replace(nominal, is_open=False).build())
+        self.nominal = PartSurface(nominal.build())
+        self._closed = PartSurface(replace(nominal, is_open=False).build())
+        self.deform: Callable[[Floats], Floats] | None = None
 
-    def compare(
-        self,
-        rng: np.random.Generator,
-        nominal: PartSurface,
-        deform: Callable[[Floats], Floats] | None,
-    ) -> tuple[Floats, Floats, Floats]:
-        """Of places on both surfaces: themselves (n, 3), the signed deviation (n,) mm, and the
-        nearest places on the true surface (n, 3), which show it."""
-        on_true, on_nominal = self.surface.cover(rng), nominal.cover(rng)
-        if deform:
-            on_true, on_nominal = deform(on_true), on_nominal[:0]
-        excess = nominal.closest(on_true)[1] * np.where(self._nominal.contains(on_true), -1, 1)
-        feet, lack = self.surface.closest(on_nominal)
-        lack *= np.where(self._solid.contains(on_nominal), 1, -1)
-        places = np.concatenate([on_true, on_nominal])
+    def compare(self, rng: np.random.Generator, T: Floats = EYE) -> tuple[Floats, Floats, Floats]:
+        """Of places on both surfaces, the part moved by ``T`` (4, 4): themselves (n, 3), the signed
+        deviation (n,) mm, and the nearest places on the true surface (n, 3), which show it."""
+        on_true, on_nominal = self.surface.cover(rng), self.nominal.cover(rng)
+        if self.deform:
+            on_true, on_nominal = self.deform(on_true), on_nominal[:0]
+        on_true, back = move_points(T, on_true), np.linalg.inv(T)
+        excess, is_inside = self.measure(on_true)
+        excess = np.where(is_inside, -excess, excess)
+        feet, lack = self.surface.closest(move_points(back, on_nominal))
+        lack *= np.where(self._solid.contains(move_points(back, on_nominal)), 1, -1)
+        places, feet = np.concatenate([on_true, on_nominal]), move_points(T, feet)
         return places, np.concatenate([excess, lack]), np.concatenate([on_true, feet])
+
+    def measure(self, points: Floats) -> tuple[Floats, Mask]:
+        """Distances (n,) mm of points (n, 3) from the nominal part, and which are inside it."""
+        return self.nominal.closest(points)[1], self._closed.contains(points)
 
 
 def _is_symmetric(

@@ -13,15 +13,22 @@ import numpy as np
 
 from slviewer.errors import SlviewerError
 from slviewer.evaluation.render import Row
-from slviewer.geometry.rigid import move_points
+from slviewer.geometry.rigid import Floats
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.exclusion import NOISE
 from slviewer.inspection.tolerance import judge_deviation
 from slviewer.inspection.wrong_part import explain_misfit
 from slviewer.pipeline.operation import Progress
+from slviewer.records.measurement import DeviatingPlace
 from slviewer.registration.refusal import WrongPart
 from slviewer.simulation.parts import UnsuitedPartError
-from slviewer.validation.part_cases import CaseSetup, PartCase, make_case, plan_part_cases
+from slviewer.validation.part_cases import (
+    CaseSetup,
+    PartCase,
+    PlacedPart,
+    make_case,
+    plan_part_cases,
+)
 from slviewer.validation.proof import BandCheck, Proof, prove_checks
 
 CASES, PROCESSES = 1200, 2
@@ -38,23 +45,17 @@ Verdict = Literal["pass", "fail", "undecided", "refused"]
 @dataclass(frozen=True)
 class Answer:
     """A verdict on a part; ``places`` (k, 3) mm that it names in the nominal's frame, with their
-    values and uncertainties mm, (k,) each, and ``kinds``; ``message``: other reasons.
-    ``shifts_mm`` (k,): what the best fit adds to the deviations there, by its difference from the
-    true pose; ``largest_mm``: true deviation at the best fit."""
+    values and uncertainties mm, (k,) each, and ``kinds``; ``message``: other reasons;
+    ``T_nominal_scan`` (4, 4): the pose found, None without one."""
 
     verdict: Verdict
-    places: np.ndarray
-    values_mm: np.ndarray
-    U_mm: np.ndarray
-    shifts_mm: np.ndarray
-    largest_mm: float = np.inf
-    kinds: tuple[str, ...] = ()
+    places: tuple[DeviatingPlace, ...] = ()
     message: str = ""
+    T_nominal_scan: Floats | None = None
 
 
 def judge_scan(case: PartCase) -> Answer:
     """The program's verdict on a scan of a part."""
-    none = np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0)
     try:
         result = deviation(
             case.points,
@@ -67,29 +68,11 @@ def judge_scan(case: PartCase) -> Answer:
         if verdict.decision != "pass":
             verdict = verdict.of_other_part(_explain(case, result))
     except WrongPart as error:
-        return Answer("fail", *none, message=str(error))
+        return Answer("fail", message=str(error))
     except SlviewerError as error:
-        return Answer("refused", *none, message=str(error))
-    places = np.array([each.place for each in verdict.places]).reshape(-1, 3)
-    at_fit = case.changed_mm + _list_shifts(case, result, case.changed)
-    return Answer(
-        verdict.decision,
-        places,
-        np.array([each.value_mm for each in verdict.places]),
-        np.array([each.U_mm for each in verdict.places]),
-        _list_shifts(case, result, places),
-        float(np.abs(at_fit).max(initial=0.0)),
-        tuple(each.kind for each in verdict.places),
-        verdict.reason or "; ".join(verdict.doubts),
-    )
-
-
-def _list_shifts(case: PartCase, result: Deviation, places: np.ndarray) -> np.ndarray:
-    """What the difference of the best fit from the true pose adds to deviations, (k,) mm."""
-    if not len(places):
-        return np.zeros(0)
-    moved = move_points(result.T_nominal_scan @ np.linalg.inv(case.T_nominal_scan), places)
-    return np.asarray(np.einsum("ij,ij->i", moved - places, result.surface.signed(places)[1]))
+        return Answer("refused", message=str(error))
+    message = verdict.reason or "; ".join(verdict.doubts)
+    return Answer(verdict.decision, verdict.places, message, result.T_nominal_scan)
 
 
 def _explain(case: PartCase, result: Deviation) -> str:
@@ -106,9 +89,10 @@ def _explain(case: PartCase, result: Deviation) -> str:
 
 @dataclass(frozen=True)
 class JudgedCase:
-    """A case and the verdict on it. ``conforms``: a fault that the best fit spreads so that the
-    part lies within the tolerance. ``is_place_right``, ``is_value_right``: of the first place of a
-    true fail; None where there is none. ``seen``, ``evidence``, ``in_view`` as in `PartCase`."""
+    """A case and the verdict on it, against the part as it is at the pose that was found.
+    ``conforms``: a fault that the best fit spreads so that the part lies within the tolerance.
+    ``is_place_right``, ``is_value_right``: of the first place of a true fail; None where there is
+    none. ``seen``, ``evidence``, ``in_view`` as in `PartCase` and `PlacedPart`."""
 
     setup: CaseSetup
     verdict: Verdict
@@ -160,26 +144,38 @@ def judge_part_case(setup: CaseSetup) -> JudgedCase | None:
     start = perf_counter()
     answer = judge_scan(case)
     seconds = perf_counter() - start
+    T = case.T_nominal_scan if answer.T_nominal_scan is None else answer.T_nominal_scan
+    part = case.placed_at(T)
     is_place_right = is_value_right = None
     is_true_fail = setup.expected == answer.verdict == "fail"
-    if is_true_fail and len(answer.places) and setup.fault not in FIGURELESS:
-        value = answer.values_mm[0] - answer.shifts_mm[0]
-        off, U = case.changed_near(answer.places[0]) - value, answer.U_mm[0]
-        is_place_right = len(off) > 0
-        is_value_right = is_place_right and bool(off.min() <= U and off.max() >= -U)
+    if is_true_fail and answer.places and setup.fault not in FIGURELESS:
+        is_place_right, is_value_right = _check_place(part, answer.places[0])
+        if setup.clutter == "touching clamp":  # itself a place, until the operator excludes it
+            checked = (_check_place(part, place) for place in answer.places)
+            found = next((each for each in checked if each[0]), None)
+            is_place_right, is_value_right = found or (is_place_right, is_value_right)
     return JudgedCase(
         setup,
         answer.verdict,
-        answer.largest_mm <= case.tolerance_mm,
-        case.in_view,
+        part.conforms,
+        part.in_view,
         case.seen,
-        case.evidence,
+        part.evidence,
         is_place_right,
         is_value_right,
-        answer.kinds,
+        tuple(place.kind for place in answer.places),
         answer.message,
         seconds,
     )
+
+
+def _check_place(part: PlacedPart, named: DeviatingPlace) -> tuple[bool, bool]:
+    """Whether a part is out of tolerance at a named place, and by its value within its U."""
+    near = part.deviations_near(np.array(named.place), np.sign(named.value_mm))
+    if not len(near):
+        return False, False
+    off = near - named.value_mm
+    return True, bool(off.min() <= named.U_mm and off.max() >= -named.U_mm)
 
 
 def prove_parts(scale: float, seed: int, progress: Progress) -> Proof:

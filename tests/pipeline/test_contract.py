@@ -55,6 +55,7 @@ name = "plane"
 name = "middle"
 kind = "plane"
 region = {kind = "ball", centre = [0.0, 0.0, 600.0], size = [400.0]}
+filled = 5.0
 [[characteristic]]
 name = "flatness"
 kind = "flatness"
