@@ -111,14 +111,20 @@ class PartCase:
         for side in (is_inside, ~is_inside):
             own = np.flatnonzero(side & (excess > 0))
             shown += [excess[own[each]] for each in label_clusters(measured[own], link)]
-        return PlacedPart(self, places, deviations, shown)
+        return PlacedPart(
+            self,
+            np.concatenate([places, measured]),
+            np.concatenate([deviations, np.where(is_inside, -off, off)]),
+            shown,
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedPart:
     """A part at a pose: ``places`` (k, 3) in the nominal's frame, all over the true surface and the
-    nominal one, and their ``deviations`` (k,) mm, positive for too much material; and of each
-    cluster of measured points that are out of tolerance by how much, ``excess_mm``."""
+    nominal one and where it was measured, and their ``deviations`` (k,) mm, positive for too much
+    material; and of each cluster of measured points that are out of tolerance by how much,
+    ``excess_mm``."""
 
     case: PartCase
     places: Floats

@@ -42,6 +42,10 @@ CLEAR = 0.5
 wrong there, must be decided."""
 ENOUGH = {"plane": 500, "cylinder": 1_600, "sphere": 1_600}
 """Points of a feature, from which on it must be decided: a section of it holds a tenth."""
+LOCAL = ("dent", "burr", "flat")
+SHOWN, MIN_EVIDENCE = 0.25, 6
+"""Of a local fault's size: so many points of the feature must deviate by more, or it is not
+shown."""
 Truth = Literal["right", "wrong", "unclear"]
 FITTED = ("base", "left", "front", "block", "pin", "hole", "dome")
 KINDS = {"plane": "flatness", "cylinder": "cylindricity", "sphere": "roundness"}
@@ -272,13 +276,25 @@ def judge_planned_part(seed: int) -> list[PlanCase]:
     truths = [_fit_all(part, scene, kind, only_seen) for only_seen in (False, True)]
     if kind == "best fit":  # how far a fault moves the part depends on what the fit weighs
         truths += [_fit_all(part, scene, "none", only_seen) for only_seen in (False, True)]
-    clamps = scene.clean[scene.names == "clamp"]
-    hidden = {each.name for each in plan.feature if each.region.within(clamps).any()}
+    off, feet = _find_feet(scene.mesh, scene.clean)
+    is_clamp = scene.names == "clamp"
+    near = np.concatenate([scene.clean[is_clamp], feet[is_clamp]])
+    hidden = {each.name for each in plan.feature if each.region.within(near).any()}
+    deviating = off[scene.names == part.fault.feature] > SHOWN * abs(part.fault.mm)
+    is_shown = part.fault.kind not in LOCAL or int(deviating.sum()) >= MIN_EVIDENCE
     setup = _Setup(seed, "full" if is_full else "one side", kind, share)
     return [
-        _judge(setup, part, scene, wanted, result, truths, hidden)
+        _judge(setup, part, scene, wanted, result, truths, hidden, is_shown)
         for wanted, result in zip(plan.characteristic, inspection.parts[0].results, strict=True)
     ]
+
+
+def _find_feet(mesh: Any, points: Array) -> tuple[Array, Array]:
+    """Distances (n,) mm of points (n, 3) from the nominal mesh, and the nearest places (n, 3)."""
+    scene = raycasting_scene(mesh.vertices, mesh.faces)
+    tensor = open3d().core.Tensor(points.astype(np.float32))
+    feet = scene.compute_closest_points(tensor)["points"].numpy().astype(np.float64)
+    return np.linalg.norm(points - feet, axis=1), feet
 
 
 @dataclass(frozen=True)
@@ -299,6 +315,7 @@ def _judge(
     result: CharacteristicResult,
     truths: Sequence[dict[str, Any]],
     hidden: set[str],
+    is_shown: bool,
 ) -> PlanCase:
     """Compare one verdict with its truths, of all of the part and of what is seen."""
     fault, names = part.fault, tuple(name.removesuffix(" surface") for name in wanted.features)
@@ -309,6 +326,8 @@ def _judge(
     if len(set(inside)) == 1 and not (wanted.kind == "profile" and hidden & {*wanted.features}):
         truth = "right" if inside[0] else "wrong"
     own = fault.feature in names
+    if own and not is_shown:
+        truth = "unclear"
     assert wanted.upper is not None
     return PlanCase(
         setup.seed,
@@ -330,7 +349,7 @@ def _is_clear(
     part: FaultyPart, scene: MeasuredPart, setup: _Setup, names: Sequence[str], off: float
 ) -> bool:
     """Whether a right characteristic, ``off`` by a share of its tolerance, must be decided."""
-    if part.fault.feature in names and part.fault.kind in ("dent", "burr", "flat"):
+    if part.fault.feature in names and part.fault.kind in LOCAL:
         return False
     is_dense = all(np.sum(scene.names == n) >= ENOUGH[part.patches[n].kind] for n in names)
     return scene.is_full and is_dense and setup.noise < 0.2 and off <= CLEAR

@@ -20,15 +20,7 @@ def test_true_shape_is_that_of_its_points(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.computes
-@pytest.mark.parametrize(
-    "seed",
-    [
-        3,
-        pytest.param(
-            4, marks=pytest.mark.xfail(reason="one profile with a dent passes", strict=False)
-        ),
-    ],
-)
+@pytest.mark.parametrize("seed", [3, 4])
 def test_no_wrong_part_passes(seed: int) -> None:
     proof = prove_plan_faults(0.05, seed, lambda share, message: None)
     assert proof.holds, proof.text()
