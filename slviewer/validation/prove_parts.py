@@ -148,12 +148,12 @@ def judge_part_case(setup: CaseSetup) -> JudgedCase | None:
     part = case.placed_at(T)
     is_place_right = is_value_right = None
     is_true_fail = setup.expected == answer.verdict == "fail"
-    if is_true_fail and answer.places and setup.fault not in FIGURELESS:
-        is_place_right, is_value_right = _check_place(part, answer.places[0])
+    if is_true_fail and setup.fault not in FIGURELESS:
+        checked = [_check_place(part, place) for place in answer.places] or [(False, False)]
+        is_place_right, is_value_right = checked[0]
         if setup.clutter == "touching clamp":  # itself a place, until the operator excludes it
-            checked = (_check_place(part, place) for place in answer.places)
-            found = next((each for each in checked if each[0]), None)
-            is_place_right, is_value_right = found or (is_place_right, is_value_right)
+            missed = (False, False) if part.in_view else (None, None)
+            is_place_right, is_value_right = next((each for each in checked if each[0]), missed)
     return JudgedCase(
         setup,
         answer.verdict,
@@ -202,7 +202,7 @@ def summarize_parts(cases: Sequence[JudgedCase], scale: float) -> Proof:
     wrong = [c for c in cases if c.expected == "fail"]
     full = [c for c in cases if c.setup.view == "full" and c.setup.clutter not in HIDING]
     full = [c for c in full if c.in_view or c.expected == "pass"]
-    named = [c for c in wrong if c.verdict == "fail" and c.setup.fault not in FIGURELESS]
+    named = [c for c in wrong if c.is_place_right is not None]
     false_fails = _share(right, lambda c: c.outcome == "FALSE FAIL")
     open_cases = _share(full, lambda c: c.verdict in ("undecided", "refused"))
     places = _share(named, lambda c: bool(c.is_place_right))

@@ -5,7 +5,12 @@ from dataclasses import replace
 import pytest
 
 from slviewer.validation.part_cases import CaseSetup
-from slviewer.validation.prove_parts import JudgedCase, judge_part_case, summarize_parts
+from slviewer.validation.prove_parts import (
+    JudgedCase,
+    judge_part_case,
+    prove_parts,
+    summarize_parts,
+)
 
 RIGHT = CaseSetup(0, 0, "pins", "none", 0.0, "full", "none", "imported")
 WRONG = replace(RIGHT, fault="moved", size=5.0)
@@ -42,3 +47,11 @@ def test_claim_holds_only_without_false_verdicts() -> None:
 @pytest.mark.computes
 def test_a_plain_case_is_judged() -> None:
     assert judge_part_case(replace(RIGHT, seed=1)).verdict in ("pass", "undecided")
+
+
+@pytest.mark.slow
+@pytest.mark.computes
+def test_no_wrong_part_passes_and_no_right_one_fails() -> None:
+    proof = prove_parts(0.04, 5, lambda share, message: None)
+    false = [line for line in proof.text().splitlines() if line.startswith("FALSE")]
+    assert not false and len(proof.record["cases"]) > 40, proof.text()
