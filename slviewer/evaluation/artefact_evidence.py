@@ -1,8 +1,8 @@
 """What a fit to an artefact rests on: the share of the visible surface that was measured, what was
 excluded, and deviations that neighbouring points share, which no noise explains.
 
-A fit excludes stray points, and its patch ends where a surface departs from the shape. What departs
-in one place is no stray: a point inside of a ball, or behind a plate, belongs to the artefact.
+A fit excludes stray points, and its patch ends where a surface departs from the shape. Points that
+depart in one place are not strays: inside a ball, or behind a plate, they belong to the artefact.
 """
 
 import cv2

@@ -217,8 +217,8 @@ def conclude_fits(fits: Fits) -> tuple[Answer, str]:
         return "disagrees", " or ".join(REMEDIES[each] for each in rivals)
     if own.misfit <= own.limit and own.scale:
         return "disagrees", (
-            f"T would have to be {own.scale:.4g} times as long, which is no change of unit: check"
-            " the known length, such as the board's pitch, and the camera's matrix"
+            f"T would have to be {own.scale:.4g} times as long, which no unit explains: check the"
+            " known length, such as the board's pitch, and the camera's matrix"
         )
     return "disagrees", OTHER_RIG
 

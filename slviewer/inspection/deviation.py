@@ -23,14 +23,14 @@ from slviewer.inspection.exclusion import (
     classify_points,
     find_tables,
 )
-from slviewer.inspection.nominal_surface import (
+from slviewer.inspection.nominal_pose import (
     GOOD_ERROR,
     REACH,
-    NominalSurface,
     fit_pose,
     improve_pose,
     search_pose,
 )
+from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.uncertainty import scatter_covariance
 from slviewer.inspection.wrong_part import explain_misfit
 from slviewer.records.measurement import ExcludedPoints

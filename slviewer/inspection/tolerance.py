@@ -181,7 +181,7 @@ def _list_points(deviation: Deviation, sigma_mm: Floats, common_mm: Floats | Non
     unmatched = deviation.is_unmatched[counted]
     places = deviation.located[counted]
     points = _Points(places, facing[counted], value, noise, common.astype(np.float64), unmatched)
-    # the part's form is no uncertainty of a best fit to it
+    # the part's form does not make a best fit to it uncertain
     share = min(1.0, float(np.median(noise)) / max(rms(value[~unmatched]), 1e-12))
     if len(points) > MOST_MEANS:
         side = deviation.area.spacing_mm * np.sqrt(len(points) / MOST_MEANS) / 3

@@ -16,7 +16,8 @@ from slviewer.geometry.rigid import (
 )
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 from slviewer.geometry.vectors import diagonal, rms_length, subsample, unit_vectors
-from slviewer.inspection.nominal_surface import VIEWS, NominalSurface, improve_pose, search_pose
+from slviewer.inspection.nominal_pose import VIEWS, improve_pose, search_pose
+from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.registration.refusal import Refused
 from slviewer.surface.shapes import Mesh
 

@@ -45,8 +45,6 @@ nor the plan tells how much of the region a whole part fills."""
 MAX_TURNED_DEG, MAX_OFF_RADIUS = 20.0, 0.4
 """From the plan's direction, and from its place or radius as a share of that: a feature farther off
 is another."""
-SAME_RADIUS, MAX_OFF_SAME = 0.05, 1.0
-"""Likewise: of a feature whose radius is the plan's."""
 DATUM_ROUNDS = 4
 """Fits of the datums, each with the regions moved by the frame of the last."""
 
@@ -257,8 +255,7 @@ def _refuse_unplanned(found: Feature, planned: PlanFeature) -> None:
     if planned.place is not None:
         nominal = Feature(found.kind, np.array(planned.place), found.direction, 0.0)
         off = max(off, abs(float(nominal.distance(found.place[None])[0])))
-    is_same = abs(found.radius - planned.radius) <= SAME_RADIUS * planned.radius
-    if off > (MAX_OFF_SAME if is_same else MAX_OFF_RADIUS) * planned.radius:
+    if off > MAX_OFF_RADIUS * planned.radius:
         raise InputError(
             f"{planned.name}: the {found.kind} in its region is {off:.3g} mm off the plan's place"
             " or radius: see that the part has it there, and scan what is missing of it."

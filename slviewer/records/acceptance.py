@@ -72,7 +72,7 @@ class SurfaceEvidence(msgspec.Struct, frozen=True):
         if self.excluded > MAX_STRAYS and self.range_mm > limit_mm:
             return (
                 f"{100 * self.excluded:.0f} % of the points were excluded, and depart by"
-                f" {self.range_mm:.3f} mm together: this is no whole feature"
+                f" {self.range_mm:.3f} mm together: part of the feature is missing or covered"
             )
         return ""
 

@@ -7,7 +7,7 @@ import trimesh
 from facts import raises
 
 from slviewer.errors import InputError
-from slviewer.inspection import nominal_surface
+from slviewer.inspection import nominal_pose
 from slviewer.inspection.deviation import (
     EXCLUDED_COLOUR,
     Deviation,
@@ -203,7 +203,7 @@ def test_a_missing_step_does_not_keep_a_scan_from_its_place() -> None:
 
 @pytest.mark.slow
 @pytest.mark.computes
-def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch) -> None:
+def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
     box = trimesh.creation.box((60, 40, 20))
     points, normals = box_scan(0.01)
     z = np.array([-0.5, 0.5, -0.7071])  # the camera sees all three sides
@@ -215,9 +215,13 @@ def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch)
         Mesh(box.vertices, box.faces),
     )
     # corners; a box has no front
-    monkeypatch.setattr(nominal_surface, "VIEWS", nominal_surface.VIEWS[-2:])
-    start = nominal_surface.search_pose(
-        scan, facing, NominalSurface(nominal), None, lambda share: None
+    start = nominal_pose.search_pose(
+        scan,
+        facing,
+        NominalSurface(nominal),
+        None,
+        lambda share: None,
+        views=nominal_pose.VIEWS[-2:],
     )
     found = deviation(scan, nominal, normals=facing, initial=start)
     assert 0.0095 < found.statistics()["rms"] < 0.0125 and found.statistics()["left_out"] < 100
@@ -271,7 +275,7 @@ def test_a_scan_without_points_is_refused(ammonite) -> None:
 
 def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch) -> None:
     monkeypatch.setattr(
-        nominal_surface,
+        nominal_pose,
         "fit_pose",
         lambda *given, **options: pytest.fail("a pose was refined"),
     )
@@ -279,14 +283,14 @@ def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch
     seen = np.isfinite(points[..., 0])
     box = trimesh.creation.box((120, 100, 70))
     other = NominalSurface(Mesh(box.vertices, box.faces))
-    monkeypatch.setattr(nominal_surface, "VIEWS", nominal_surface.VIEWS[:2])
     with raises(Refused, "nominal model", "%") as refusal:
-        nominal_surface.search_pose(
+        nominal_pose.search_pose(
             points[seen][::3],
             normals[seen][::3],
             other,
             None,
             lambda share: None,
+            views=nominal_pose.VIEWS[:2],
         )
     assert refusal.value.reason == "overlap"
     with raises(InputError, "triangles"):

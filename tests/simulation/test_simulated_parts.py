@@ -89,7 +89,8 @@ def test_points_of_right_parts_lie_on_the_nominal(view, source) -> None:
     nominal = trimesh.Trimesh(*mesh_of(case))
     _, away = PartSurface(nominal).closest(move_points(case.T_nominal_scan, case.points))
     assert np.sqrt(np.mean(away**2)) == pytest.approx(np.median(case.sigma_mm), rel=0.15)
-    assert not len(case.changed) and case.evidence == 0
+    part = case.placed_at(case.T_nominal_scan)
+    assert part.conforms and part.evidence == 0 and not part.in_view
     assert (case.views is None) == (source == "imported")
 
 
@@ -99,7 +100,7 @@ def test_deformed_parts_have_the_requested_size(fault) -> None:
     nominal = trimesh.Trimesh(*mesh_of(case))
     _, away = PartSurface(nominal).closest(move_points(case.T_nominal_scan, case.points))
     assert np.sort(away)[-12] / case.tolerance_mm == pytest.approx(5, abs=1)
-    assert case.in_view
+    assert case.placed_at(case.T_nominal_scan).in_view
 
 
 def test_table_is_not_measured_below_the_part() -> None:
