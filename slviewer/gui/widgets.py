@@ -42,6 +42,9 @@ _UNIT = re.compile(
 )
 """The space between a figure and its unit, in escaped text."""
 
+_STANDARD = re.compile(r"(?<=\d{4})-(?=\d)")
+"""The hyphen in the number of a standard, as ISO 14253-1."""
+
 Tone = Literal["plain", "dim", "info", "good", "warning", "error"]
 TONES = {  # by `page_style.css`
     "plain": "var(--mantine-color-text)",
@@ -109,7 +112,9 @@ def paragraph(content: object) -> Html:
 
 
 def note(text: object, tone: Tone = "dim") -> Html:
-    """Return a paragraph of text in a tone's colour."""
+    """Return a paragraph of text in a tone's colour; numbers of standards stay whole."""
+    if isinstance(text, str) and not isinstance(text, Html):
+        text = _STANDARD.sub(NO_BREAK_HYPHEN, text)
     return paragraph(coloured(text, tone))
 
 

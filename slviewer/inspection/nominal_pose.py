@@ -55,7 +55,7 @@ EXACT_AGREEMENT = 0.995
 GOOD_OVERLAP, GOOD_AGREEMENT, NEAR = 0.6, 0.95, 5.0
 """Shares of the scan, and of its points within so many reaches of the nominal, that fit well: no
 better pose is searched for."""
-PATIENCE, MOST_PATIENCE, BETTER_COST = 2, 8, 0.95
+PATIENCE, MOST_PATIENCE, BETTER_COST = 3, 8, 0.95
 """Sides searched without a pose of so much lower cost, after one whose points do not all fit well:
 a part with an error has no better one; more where hardly half of them fit."""
 LEAST_SCORE = 0.1
@@ -71,10 +71,12 @@ VIEWS = [
 """From where a model is looked at: its sides, from below and above first, then its edges, then its
 corners."""
 TURNED_POINTS, TURN_ROUNDS = 1_000, 8
-RIVAL_SHARE = 0.6
-"""Of the points that lie near the model: so many do at a turned pose that is tried."""
+SHIFTED_POINTS, RIVAL_SHARE = 120, 0.6
+"""Of a scan by which turned and shifted poses are chosen; and of those that lie near the model: so
+many do at one that is tried."""
 RIVALS = 24
-"""Turned and shifted poses that are tried."""
+"""Turned and shifted poses that are tried, half of them those of least cost, the others those with
+most of the scan near the model."""
 NUDGES_DEG, NUDGED = (-3.0, 3.0), 3
 """How far, and how many of the best of these, are turned on."""
 RIGHT_TURNS = Rotation.create_group("O").as_matrix()
@@ -271,18 +273,18 @@ def _list_turned(
     """Return poses (4, 4) at which nearly as much of a scan lies near the model: turned by right
     angles, and moved to where its ends meet; and on by a few degrees where the ``pose`` is not
     exact."""
-    some = subsample(points, RACED_POINTS)
-    own = None if normals is None else subsample(normals, RACED_POINTS)
+    some = subsample(points, SHIFTED_POINTS)
+    own = None if normals is None else subsample(normals, SHIFTED_POINTS)
     axes, middle = surface.main_axes()
-    turns = [axes @ R @ axes.T for R in RIGHT_TURNS]
     tried = [pose.T]
-    for R in turns:
-        tried += _list_shifted(
-            some, surface, axes, rigid_transform(R, middle - R @ middle) @ pose.T
-        )
-    shares = [_share_on(some, own, surface, T) for T in tried]
-    best = np.argsort(shares)[::-1][:RIVALS]
-    order = [k for k in best if shares[k] >= RIVAL_SHARE * shares[0]]
+    for R in [axes @ R @ axes.T for R in RIGHT_TURNS]:
+        turned = rigid_transform(R, middle - R @ middle) @ pose.T
+        tried += _list_shifted(some, surface, axes, turned)
+    reach = REACH * surface.diagonal
+    off = np.array([surface.distances(some, own, T, 2 * reach)[0] for T in tried])
+    shares, costs = np.isfinite(off).mean(axis=1), _cap(off / reach).mean(axis=1)
+    first = (*np.argsort(costs)[: RIVALS // 2], *np.argsort(-shares)[:RIVALS])
+    order = [k for k in dict.fromkeys(first) if shares[k] >= RIVAL_SHARE * shares[0]][:RIVALS]
     starts = [tried[k] for k in order if k]
     if pose.is_exact:
         return starts
@@ -291,19 +293,12 @@ def _list_turned(
 
 
 def _list_shifted(points: Floats, surface: NominalSurface, axes: Floats, T: Floats) -> list[Floats]:
-    """Return a pose (4, 4) as it is, and shifted along each of the model's axes so that the lower
-    or the upper ends of scan and model meet: turned over, a plate lies elsewhere."""
+    """Return a pose (4, 4) as it is, and shifted along any of the model's axes so that the lower or
+    the upper ends of scan and model meet: turned over, a plate lies elsewhere."""
     scan, model = move_points(T, points) @ axes, surface.vertices @ axes
-    ends = np.percentile(scan, [1, 99], axis=0)
-    shifts = np.stack([model.min(axis=0), model.max(axis=0)]) - ends
-    return [
-        T,
-        *(
-            rigid_transform(np.eye(3), s * a) @ T
-            for row in shifts
-            for s, a in zip(row, axes.T, strict=True)
-        ),
-    ]
+    low, high = np.percentile(scan, [1, 99], axis=0)
+    ends = zip(np.zeros(3), model.min(axis=0) - low, model.max(axis=0) - high, strict=True)
+    return [rigid_transform(np.eye(3), axes @ shift) @ T for shift in product(*ends)]
 
 
 def improve_pose(
@@ -319,12 +314,6 @@ def improve_pose(
     return _improve_pose(
         some, own, surface, sigma_mm, _fit_start(some, own, surface, T, sigma_mm)
     ).T
-
-
-def _share_on(points: Floats, normals: Floats | None, surface: NominalSurface, T: Floats) -> float:
-    """Return the share of a scan near the model at a pose."""
-    off = surface.distances(points, normals, T, 2 * REACH * surface.diagonal)[0]
-    return float(np.isfinite(off).mean())
 
 
 def _list_sides(

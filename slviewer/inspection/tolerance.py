@@ -56,11 +56,12 @@ the operator wants a verdict on a smaller area."""
 @dataclass(frozen=True, eq=False)
 class _Points:
     """Deviations ``value`` (n,) mm of points, or of several combined (``count``), where they lie,
-    in the nominal's frame, how they face, and their standard deviations of noise and, common to
-    neighbours, of calibration and alignment."""
+    in the nominal's frame, how they face and how the nominal does there, and their standard
+    deviations of noise and, common to neighbours, of calibration and alignment."""
 
     place: Floats
     facing: Floats
+    towards: Floats
     value: Floats
     noise: Floats
     common: Floats
@@ -171,23 +172,24 @@ def _judge_end(means: _Means, sign: int, count: int, tolerance: float) -> tuple[
 def _list_points(deviation: Deviation, sigma_mm: Floats, common_mm: Floats | None) -> _Points:
     """Return the deviations of a scan, combined to at most about `MOST_MEANS`."""
     counted = deviation.counted
-    facing = deviation.facing
-    if facing is None or not np.isfinite(facing[counted]).all():
-        towards = deviation.normals @ deviation.T_nominal_scan[:3, :3].T
-        facing = towards if facing is None else np.where(np.isfinite(facing), facing, towards)
+    towards = (deviation.normals[counted] @ deviation.T_nominal_scan[:3, :3].T).astype(np.float64)
+    facing = towards if deviation.facing is None else deviation.facing[counted]
+    if not np.isfinite(facing).all():
+        facing = np.where(np.isfinite(facing), facing, towards)
     value = deviation.signed[counted].astype(np.float64)
     noise = np.maximum(np.nan_to_num(sigma_mm[counted]).astype(np.float64), deviation.noise_mm)
     common = np.zeros(len(value)) if common_mm is None else np.nan_to_num(common_mm[counted])
     unmatched = deviation.is_unmatched[counted]
     places = deviation.located[counted]
-    points = _Points(places, facing[counted], value, noise, common.astype(np.float64), unmatched)
+    common = common.astype(np.float64)
+    points = _Points(places, facing, towards, value, noise, common, unmatched)
     # the part's form does not make a best fit to it uncertain
     share = min(1.0, float(np.median(noise)) / max(rms(value[~unmatched]), 1e-12))
     if len(points) > MOST_MEANS:
         side = deviation.area.spacing_mm * np.sqrt(len(points) / MOST_MEANS) / 3
         points = _combine(points, side)
     spread = deviation.alignment_spread
-    J = distance_jacobian(points.place - spread.centre, points.facing)
+    J = distance_jacobian(points.place - spread.centre, points.towards)
     aligned = share * np.sqrt(np.einsum("ni,ij,nj->n", J, spread.covariance, J))
     return replace(points, common=np.hypot(points.common, aligned))
 
@@ -207,6 +209,7 @@ def _combine(points: _Points, side: float) -> _Points:
     return _Points(
         np.stack([mean(column) for column in points.place.T], axis=1),
         np.stack([mean(column) for column in points.facing.T], axis=1),
+        np.stack([mean(column) for column in points.towards.T], axis=1),
         mean(points.value),
         mean(points.noise) / np.sqrt(count),
         mean(points.common),

@@ -47,7 +47,8 @@ SHOWN, MIN_EVIDENCE = 0.25, 6
 """Of a local fault's size: so many points of the feature must deviate by more, or it is not
 shown."""
 Truth = Literal["right", "wrong", "unclear"]
-FITTED = ("base", "left", "front", "block", "pin", "hole", "dome")
+DATUMS = ("base", "left", "front")
+FITTED = (*DATUMS, "block", "pin", "hole", "dome")
 KINDS = {"plane": "flatness", "cylinder": "cylindricity", "sphere": "roundness"}
 
 
@@ -218,7 +219,7 @@ def draw_plan(part: FaultyPart, scene: MeasuredPart, rng: Rng, kind: str, nomina
         alignment = Alignment(
             "3-2-1",
             None,
-            ("base", "left", "front"),
+            DATUMS,
             tuple(map(tuple, start.tolist())),  # type: ignore[arg-type]
         )
     elif kind == "best fit":
@@ -351,6 +352,8 @@ def _is_clear(
     """Whether a right characteristic, ``off`` by a share of its tolerance, must be decided."""
     if part.fault.feature in names and part.fault.kind in LOCAL:
         return False
+    if setup.alignment == "3-2-1" and part.fault.feature in DATUMS:
+        return False  # features may lie where the plan has others
     is_dense = all(np.sum(scene.names == n) >= ENOUGH[part.patches[n].kind] for n in names)
     return scene.is_full and is_dense and setup.noise < 0.2 and off <= CLEAR
 
@@ -381,7 +384,7 @@ def _fit_all(part: FaultyPart, scene: MeasuredPart, kind: str, only_seen: bool) 
             points[name] = own
             fits[name] = fit_true(part.patches[name], own, part.patches[name].axes[2])
     T = np.eye(4)
-    if kind == "3-2-1" and {"base", "left", "front"} <= fits.keys():
+    if kind == "3-2-1" and {*DATUMS} <= fits.keys():
         T = place_corner(part) @ true_datum_frame(fits)
     elif kind == "best fit":
         belongs = scene.names != "clamp"
