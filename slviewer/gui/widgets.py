@@ -42,9 +42,7 @@ _UNIT = re.compile(
 )
 """The space between a figure and its unit, in escaped text."""
 
-_STANDARD = re.compile(r"(?<=\d{4})-(?=\d)")
-"""The hyphen in the number of a standard, as ISO 14253-1."""
-
+_STANDARD = re.compile(r"(?<=ISO \d{5})-(?=\d)")  # the hyphen in its number
 Tone = Literal["plain", "dim", "info", "good", "warning", "error"]
 TONES = {  # by `page_style.css`
     "plain": "var(--mantine-color-text)",
@@ -86,11 +84,10 @@ def to_html(text: object) -> Html:
 
     Passwords in addresses are hidden: whoever watches reads this too.
     """
-    return (
-        text
-        if isinstance(text, Html)
-        else Html(_UNIT.sub("&#160;", escape(hide_passwords(str(text)))))
-    )
+    if isinstance(text, Html):
+        return text
+    escaped = _STANDARD.sub(NO_BREAK_HYPHEN, escape(hide_passwords(str(text))))
+    return Html(_UNIT.sub("&#160;", escaped))
 
 
 def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:
@@ -112,9 +109,7 @@ def paragraph(content: object) -> Html:
 
 
 def note(text: object, tone: Tone = "dim") -> Html:
-    """Return a paragraph of text in a tone's colour; numbers of standards stay whole."""
-    if isinstance(text, str) and not isinstance(text, Html):
-        text = _STANDARD.sub(NO_BREAK_HYPHEN, text)
+    """Return a paragraph of text in a tone's colour."""
     return paragraph(coloured(text, tone))
 
 
