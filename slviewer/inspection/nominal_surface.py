@@ -100,10 +100,11 @@ class NominalSurface:
 
     def _find_nearest(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """`signed`, and the unit normals (n, 3), at edges between those of their faces."""
-        count = range(0, max(len(points), 1), CHUNK)  # that the caches hold
-        found = [self._find_few(points[k : k + CHUNK]) for k in count]
-        away, normals, smooth = (np.concatenate(each) for each in zip(*found, strict=True))
-        return away, normals, smooth
+        found = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3))
+        for k in range(0, len(points), CHUNK):  # that the caches hold
+            for whole, part in zip(found, self._find_few(points[k : k + CHUNK]), strict=True):
+                whole[k : k + CHUNK] = part
+        return found
 
     def _find_few(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """`_find_nearest` of fewer points."""

@@ -73,7 +73,7 @@ def explain_misfit(
     if T is not None:
         scale, sigma = _fit_scale(points, normals, surface, T, near_mm)
         scaled = NominalSurface(_scale(nominal, scale, surface.middle))
-        share = _share_off(points, normals, scaled, _refit(points, normals, scaled, T), near_mm)
+        share = _share_off_best(points, normals, scaled, T, near_mm)
         if abs(scale - 1) > SCALE_SIGMAS * sigma and share < most:
             change = "larger" if scale > 1 else "smaller"
             return (
@@ -88,14 +88,10 @@ def explain_misfit(
             if T is not None:  # whose outline is the model's
                 start = rigid_transform(np.eye(3), other.middle - surface.middle) @ T
                 pose = improve_pose(points, normals, other, near / 4, start)
-                share = _share_off(
-                    points, normals, other, _refit(points, normals, other, pose), near
-                )
+                share = _share_off_best(points, normals, other, pose, near)
             if share >= most and off > MOST_OFF:
                 pose = search_pose(points, normals, other, near / 4, _ignore, has_camera, views)
-                share = _share_off(
-                    points, normals, other, _refit(points, normals, other, pose), near
-                )
+                share = _share_off_best(points, normals, other, pose, near)
             if share < most:
                 return (
                     f"the scan fits {words} ({100 * (1 - share):.0f} % of its points lie within"
@@ -132,9 +128,12 @@ def _share_off(
     return float(np.mean(~np.isfinite(surface.distances(points, normals, T, near)[0])))
 
 
-def _refit(points: Floats, normals: Floats | None, surface: NominalSurface, T: Floats) -> Floats:
-    """Return the pose (4, 4) of most points of a scan on a model."""
-    return _fit(points, normals, surface, T, with_scale=False)[0]
+def _share_off_best(
+    points: Floats, normals: Floats | None, surface: NominalSurface, T: Floats, near: float
+) -> float:
+    """Return `_share_off` at the pose of most points of a scan on a model, found from ``T``."""
+    best = _fit(points, normals, surface, T, with_scale=False)[0]
+    return _share_off(points, normals, surface, best, near)
 
 
 def _fit_scale(

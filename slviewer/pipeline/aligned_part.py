@@ -42,6 +42,10 @@ from slviewer.session.nominal import Nominal
 LEAST_FILLED = 50.0
 """Percent of a feature's area in its region that a decision needs, where neither a nominal model
 nor the plan tells how much of the region a whole part fills."""
+STATE_FILLED = (
+    "; if its region is larger than the feature, state in the plan what percent of it a whole part"
+    " fills, as filled"
+)
 MAX_TURNED_DEG, MAX_OFF_RADIUS = 20.0, 0.4
 """From the plan's direction, and from its place or radius as a share of that: a feature farther off
 is another."""
@@ -185,11 +189,7 @@ class AlignedPart:
         if self._area is None and filled is not None:
             needed = min_area * filled / 100
         elif self._area is None:
-            needed = min(min_area, LEAST_FILLED)
-            more = (
-                "; if its region is larger than the feature, state in the plan what percent of it"
-            )
-            more += " a whole part fills, as filled"
+            needed, more = min(min_area, LEAST_FILLED), STATE_FILLED
         if measured is None or measured >= needed:
             return ""
         return (

@@ -52,7 +52,7 @@ view."""
 MIN_SHOWN = 0.2
 """Of a deformation, over its largest displacement, what the measured points have to deviate by."""
 SPACINGS = 3.0
-"""From a place to the nearest one that was measured, or that changed."""
+"""From a place to the nearest one that was measured, or that deviates."""
 EYE = np.eye(4)
 TOUCHING = 1e-4
 """Distance of what touches, over the part's size."""

@@ -44,9 +44,8 @@ Verdict = Literal["pass", "fail", "undecided", "refused"]
 
 @dataclass(frozen=True)
 class Answer:
-    """A verdict on a part; ``places`` (k, 3) mm that it names in the nominal's frame, with their
-    values and uncertainties mm, (k,) each, and ``kinds``; ``message``: other reasons;
-    ``T_nominal_scan`` (4, 4): the pose found, None without one."""
+    """A verdict on a part; ``places`` that it names in the nominal's frame; ``message``: other
+    reasons; ``T_nominal_scan`` (4, 4): the pose found, None without one."""
 
     verdict: Verdict
     places: tuple[DeviatingPlace, ...] = ()
