@@ -86,8 +86,8 @@ def to_html(text: object) -> Html:
     """
     if isinstance(text, Html):
         return text
-    escaped = _STANDARD.sub(NO_BREAK_HYPHEN, escape(hide_passwords(str(text))))
-    return Html(_UNIT.sub("&#160;", escaped))
+    whole = _STANDARD.sub(NO_BREAK_HYPHEN, hide_passwords(str(text)))
+    return Html(_UNIT.sub("&#160;", escape(whole)))
 
 
 def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:
