@@ -52,9 +52,9 @@ GOOD_ERROR = 0.002
 """Of the nominal's diagonal, or thrice the noise: points fit well that deviate less."""
 EXACT_AGREEMENT = 0.995
 """Share of the points nearby that fit well: fewer may be small features out of place."""
-GOOD_OVERLAP, GOOD_AGREEMENT, NEAR = 0.6, 0.95, 5.0
-"""Shares of the scan, and of its points within so many reaches of the nominal, that fit well: no
-better pose is searched for."""
+GOOD_OVERLAP, MOST_OVERLAP, GOOD_AGREEMENT, NEAR = 0.6, 0.9, 0.95, 5.0
+"""Shares of the scan that lie on the nominal of a likely pose, and of one than which no better is
+searched for; there fit well so many of its points within so many reaches of the nominal."""
 PATIENCE, MOST_PATIENCE, BETTER_COST = 3, 8, 0.95
 """Sides searched without a pose of so much lower cost, after one whose points do not all fit well:
 a part with an error has no better one; more where hardly half of them fit."""
@@ -79,6 +79,9 @@ RIVALS = 24
 most of the scan near the model."""
 NUDGES_DEG, NUDGED = (-3.0, 3.0), 3
 """How far, and how many of the best of these, are turned on."""
+FACE_SAMPLES, STEPS, ACROSS = 5_000, 200, 0.9
+"""Points of the model, and steps of its extent, by which faces are met whose normals lie so near an
+axis (cosine)."""
 RIGHT_TURNS = Rotation.create_group("O").as_matrix()
 """The rotations (24, 3, 3) of a cube, which none is among."""
 MIN_FACING_COSINE = 0.1
@@ -276,10 +279,15 @@ def _list_turned(
     some = subsample(points, SHIFTED_POINTS)
     own = None if normals is None else subsample(normals, SHIFTED_POINTS)
     axes, middle = surface.main_axes()
+    places, facing = surface.sample(FACE_SAMPLES)
+    either = abs if not surface.is_solid else np.asarray  # of unknown sides
+    model = _Faces(places @ axes, either(facing @ axes))
+    unknown = np.zeros_like(points) if normals is None else normals
     tried = [pose.T]
     for R in [axes @ R @ axes.T for R in RIGHT_TURNS]:
         turned = rigid_transform(R, middle - R @ middle) @ pose.T
-        tried += _list_shifted(some, surface, axes, turned)
+        scan = _Faces(move_points(turned, points) @ axes, either(unknown @ turned[:3, :3].T @ axes))
+        tried += _list_shifted(scan, model, axes, turned)
     reach = REACH * surface.diagonal
     off = np.array([surface.distances(some, own, T, 2 * reach)[0] for T in tried])
     shares, costs = np.isfinite(off).mean(axis=1), _cap(off / reach).mean(axis=1)
@@ -292,13 +300,41 @@ def _list_turned(
     return starts + [nudge @ tried[k] for k in order[:NUDGED] for nudge in nudges]
 
 
-def _list_shifted(points: Floats, surface: NominalSurface, axes: Floats, T: Floats) -> list[Floats]:
-    """Return a pose (4, 4) as it is, and shifted along any of the model's axes so that the lower or
-    the upper ends of scan and model meet: turned over, a plate lies elsewhere."""
-    scan, model = move_points(T, points) @ axes, surface.vertices @ axes
-    low, high = np.percentile(scan, [1, 99], axis=0)
-    ends = zip(np.zeros(3), model.min(axis=0) - low, model.max(axis=0) - high, strict=True)
-    return [rigid_transform(np.eye(3), axes @ shift) @ T for shift in product(*ends)]
+def _list_shifted(scan: "_Faces", model: "_Faces", axes: Floats, T: Floats) -> list[Floats]:
+    """Return a pose (4, 4) as it is, and shifted along any of the model's ``axes`` so that the
+    lower or the upper ends of scan and model meet, or most of the faces across it: turned over, a
+    plate lies elsewhere."""
+    low, high = np.percentile(scan.places, [1, 99], axis=0)
+    ends = (model.places.min(axis=0) - low, model.places.max(axis=0) - high)
+    shifts = product(*zip(np.zeros(3), *ends, scan.best_shifts(model), strict=True))
+    return [rigid_transform(np.eye(3), axes @ shift) @ T for shift in shifts]
+
+
+@dataclass(frozen=True, eq=False)
+class _Faces:
+    """``places`` (n, 3) mm of a surface along three axes, and ``facing`` (n, 3) how far it faces
+    along each."""
+
+    places: Floats
+    facing: Floats
+
+    def best_shifts(self, model: "_Faces") -> Floats:
+        """The shifts (3,) mm by which most of the faces across each axis meet those of a model; 0
+        where there are none."""
+        both = np.concatenate([self.places, model.places])
+        edges = np.linspace(both.min(), both.max(), STEPS + 1)
+        shifts = np.zeros(3)
+        for k in range(3):
+            met = np.zeros(2 * STEPS - 1)
+            for sign in (1, -1):
+                own, others = (
+                    np.histogram(faces.places[sign * faces.facing[:, k] > ACROSS, k], edges)[0]
+                    for faces in (self, model)
+                )
+                met += np.correlate(others, own, "full")
+            if met.any():
+                shifts[k] = (int(met.argmax()) - STEPS + 1) * (edges[1] - edges[0])
+        return shifts
 
 
 def improve_pose(
@@ -387,7 +423,7 @@ def _judge_pose(
         cost=cost + behind * (1 if surface.is_solid else cost),
         overlap=float(np.mean(off <= gate)),
         agreement=float(np.sum(off <= gate) / max(1, np.isfinite(off).sum())),
-        is_good=bool(fitting >= max(GOOD_OVERLAP * len(points), GOOD_AGREEMENT * np.sum(near))),
+        is_good=bool(fitting >= max(MOST_OVERLAP * len(points), GOOD_AGREEMENT * np.sum(near))),
         is_exact=bool(fitting >= EXACT_AGREEMENT * np.sum(near)),
         gate_mm=gate,
     )

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.stats import norm
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, distance_jacobian
-from slviewer.geometry.vectors import occupied_cubes, rms
+from slviewer.geometry.vectors import median_spacing, occupied_cubes, rms
 from slviewer.inspection.deviation import Deviation
 from slviewer.inspection.exclusion import label_clusters
 from slviewer.records.acceptance import COVERAGE, Decision, worst_decision
@@ -31,7 +32,8 @@ FAIL_SIGMAS = {1: 3.0, 2: 2.5, 4: 2.0, 8: 2.0}
 """Standard deviations by which a mean fails, by how many times as many points it averages: there
 are hundreds of the smallest."""
 SINGLE_SIGMAS = 4.0
-"""Standard deviations by which single points fail, three or more beside each other."""
+"""Standard deviations by which single points fail, `MIN_PLACE` or more of `BESIDE` neighbours."""
+BESIDE = 8
 EXTREMES, EXTREME_SHARE = 3, 2e-4
 """Means at either end that do not keep a part from passing, as few pixels on an edge do; and their
 share of large scans. More of them beside each other are a place."""
@@ -39,6 +41,8 @@ MOST_NOISE = 3.0
 """Of the median: points whose noise is larger are not counted on."""
 SUSPECT = 0.8
 """Of the tolerance: of means beyond it wider ones are made."""
+JOINED = 3.0
+"""Spacings between points that lie beside each other."""
 MOST_MEANS = 60_000
 """Points of larger scans are combined first."""
 FACE = 3.0
@@ -252,9 +256,16 @@ def _list_places(
         points.value, np.hypot(points.noise, points.common), means.radius, 0 * means.radius
     )
     bound, certain = means.bound(), np.abs(single.value) - SINGLE_SIGMAS * single.sigma
-    is_better = (certain > bound) & (certain > tolerance)
-    bound[is_better] = certain[is_better]
-    means = _replace(means, np.flatnonzero(is_better), single.take(is_better))
+    large = np.flatnonzero((certain > bound) & (certain > tolerance))
+    if len(large) and len(points) >= BESIDE:
+        near = cKDTree(points.place).query(points.place[large], k=BESIDE)[1]
+        sided = np.sign(points.value[large])[:, None] * points.value[near]
+        last = np.argsort(sided, axis=1)[:, -MIN_PLACE]  # one or two may be spikes
+        beside = np.take_along_axis(near, last[:, None], axis=1)[:, 0]
+        is_better = certain[beside] > np.maximum(bound[large], tolerance)
+        large, beside = large[is_better], beside[is_better]
+        bound[large] = certain[beside]
+        means = _replace(means, large, single.take(beside))
     for times in list(FAIL_SIGMAS)[1:]:
         suspect = np.flatnonzero(np.abs(means.value) > SUSPECT * tolerance)
         if not len(suspect) or times * count > len(points):
@@ -263,6 +274,7 @@ def _list_places(
         is_better = wider.bound(times) > bound[suspect]
         bound[suspect[is_better]] = wider.bound(times)[is_better]
         means = _replace(means, suspect[is_better], wider.take(is_better))
+    means, bound = _join_small(points, means, bound, tolerance)
     area, link = deviation.area, max(deviation.area.spacing_mm, float(np.median(means.radius)))
     found = list[DeviatingPlace]()
     missing = np.flatnonzero(np.abs(np.nan_to_num(area.deviation)) > tolerance + area.spacing_mm)
@@ -282,6 +294,39 @@ def _list_places(
             )
     found.sort(key=lambda each: -abs(each.value_mm))
     return tuple(found[:MOST_PLACES])
+
+
+def _join_small(
+    points: _Points, means: _Means, bound: Floats, tolerance: float
+) -> tuple[_Means, Floats]:
+    """Return the means, and what they exceed for certain, with connected points beyond the
+    tolerance taken together where no mean holds them: what is thinner than a mean, as a rib.
+
+    That points were chosen as large ones makes their mean too large by what noise about the
+    tolerance would, the mean of a normal distribution cut off at `SUSPECT`.
+    """
+    noise, bound = points.noise, bound.copy()
+    link, limit = JOINED * median_spacing(cKDTree(points.place), 2000), SUSPECT * tolerance
+    cut = (limit - tolerance) / noise
+    chosen_by = noise * norm.pdf(cut) / norm.sf(cut)
+    for sign in (-1, 1):
+        large = np.flatnonzero(sign * points.value > limit)
+        for members in label_clusters(points.place[large], link):
+            own = large[members]
+            if len(own) < LEAST_POINTS or np.sum(bound[own] > tolerance) >= MIN_PLACE:
+                continue
+            kept = own[np.argsort(np.abs(points.value[own]))[1:-1]]
+            sigma = np.hypot(rms(noise[own]) / np.sqrt(len(own)), points.common[own].mean())
+            value = float(points.value[kept].mean()) - sign * float(chosen_by[own].mean())
+            certain = abs(value) - FAIL_SIGMAS[1] * sigma
+            if certain > tolerance:
+                bound[own] = certain
+                varies = np.full(len(own), max(0.0, points.value[kept].std()))
+                joined = _Means(
+                    np.full(len(own), value), np.full(len(own), sigma), means.radius[own], varies
+                )
+                means = _replace(means, own, joined)
+    return means, bound
 
 
 def _replace(means: _Means, which: np.ndarray, others: _Means) -> _Means:

@@ -63,7 +63,7 @@ def explain_misfit(
     off = 1.0 if T is None else _share_off(points, normals, surface, T, near_mm)
     if off < LEAST_OFF:
         return ""
-    most = min(BETTER * off, MOST_OFF)
+    most = BETTER if T is None else min(BETTER * off, MOST_OFF)  # without: foreign points too
     views = VIEWS
     if T is not None:  # its pose on the model says roughly from where it is seen
         seen = np.abs(unit_vectors(T[:3, 3] - surface.middle))
