@@ -82,6 +82,8 @@ NUDGES_DEG, NUDGED = (-3.0, 3.0), 3
 FACE_SAMPLES, STEPS, ACROSS = 5_000, 200, 0.9
 """Points of the model, and steps of its extent, by which faces are met whose normals lie so near an
 axis (cosine)."""
+FLAT_TURNS = np.radians([deg for deg in range(15, 360, 15) if deg % 90])
+"""About the axis along which a model is thinnest."""
 RIGHT_TURNS = Rotation.create_group("O").as_matrix()
 """The rotations (24, 3, 3) of a cube, which none is among."""
 MIN_FACING_COSINE = 0.1
@@ -279,17 +281,25 @@ def _list_turned(
     some = subsample(points, SHIFTED_POINTS)
     own = None if normals is None else subsample(normals, SHIFTED_POINTS)
     axes, middle = surface.main_axes()
+    reach = REACH * surface.diagonal
     places, facing = surface.sample(FACE_SAMPLES)
     either = abs if not surface.is_solid else np.asarray  # of unknown sides
     model = _Faces(places @ axes, either(facing @ axes))
     unknown = np.zeros_like(points) if normals is None else normals
     tried = [pose.T]
-    for R in [axes @ R @ axes.T for R in RIGHT_TURNS]:
+    turns = RIGHT_TURNS
+    if not pose.is_good:  # a plate fits roughly however it is turned in its plane
+        thin = np.eye(3)[np.ptp(model.places, axis=0).argmin()]
+        flat = Rotation.from_rotvec(np.outer(FLAT_TURNS, thin)).as_matrix()
+        over = 2 * np.diag(np.roll(thin, 1)) - np.eye(3)
+        turns = np.concatenate([turns, flat, flat @ over])
+    for R in axes @ turns @ axes.T:
         turned = rigid_transform(R, middle - R @ middle) @ pose.T
         scan = _Faces(move_points(turned, points) @ axes, either(unknown @ turned[:3, :3].T @ axes))
-        tried += _list_shifted(scan, model, axes, turned)
-    reach = REACH * surface.diagonal
-    off = np.array([surface.distances(some, own, T, 2 * reach)[0] for T in tried])
+        tried += _list_shifted(scan, model, axes, turned, reach / 2)
+    moved = np.concatenate([move_points(T, some) for T in tried])
+    facing = None if own is None else np.concatenate([own @ T[:3, :3].T for T in tried])
+    off = surface.distances(moved, facing, np.eye(4), 2 * reach)[0].reshape(len(tried), -1)
     shares, costs = np.isfinite(off).mean(axis=1), _cap(off / reach).mean(axis=1)
     first = (*np.argsort(costs)[: RIVALS // 2], *np.argsort(-shares)[:RIVALS])
     order = [k for k in dict.fromkeys(first) if shares[k] >= RIVAL_SHARE * shares[0]][:RIVALS]
@@ -300,14 +310,19 @@ def _list_turned(
     return starts + [nudge @ tried[k] for k in order[:NUDGED] for nudge in nudges]
 
 
-def _list_shifted(scan: "_Faces", model: "_Faces", axes: Floats, T: Floats) -> list[Floats]:
+def _list_shifted(
+    scan: "_Faces", model: "_Faces", axes: Floats, T: Floats, step: float
+) -> list[Floats]:
     """Return a pose (4, 4) as it is, and shifted along any of the model's ``axes`` so that the
     lower or the upper ends of scan and model meet, or most of the faces across it: turned over, a
-    plate lies elsewhere."""
+    plate lies elsewhere. Shifts of less than a ``step`` mm apart are one."""
     low, high = np.percentile(scan.places, [1, 99], axis=0)
     ends = (model.places.min(axis=0) - low, model.places.max(axis=0) - high)
-    shifts = product(*zip(np.zeros(3), *ends, scan.best_shifts(model), strict=True))
-    return [rigid_transform(np.eye(3), axes @ shift) @ T for shift in shifts]
+    listed = []
+    for each in zip(np.zeros(3), scan.best_shifts(model), *ends, strict=True):
+        apart = [x for k, x in enumerate(each) if all(abs(x - y) > step for y in each[:k])]
+        listed.append(apart)
+    return [rigid_transform(np.eye(3), axes @ shift) @ T for shift in product(*listed)]
 
 
 @dataclass(frozen=True, eq=False)
