@@ -17,6 +17,7 @@ docs/images/gallery, and those of docs/diagrams.py into docs/images/diagrams.
 
 import argparse
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -31,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+PROOFS = "python -m tests.proofs "
 sys.path.insert(0, str(ROOT))
 
 from slviewer import cli  # noqa: E402
@@ -84,7 +86,7 @@ def _mean(numbers: Iterable[float]) -> float:
 
 
 def compute_accuracy(data: dict[str, Any]) -> dict[str, float]:
-    """Return the numbers of the pages by name, from the JSON of ``prove --only accuracy``."""
+    """Return the numbers of the pages by name, from the proof of accuracy's JSON."""
     record = data["accuracy"]
     means = {
         model: [
@@ -109,7 +111,7 @@ def compute_accuracy(data: dict[str, Any]) -> dict[str, float]:
 
 
 def compute_registration(data: dict[str, Any]) -> dict[str, float]:
-    """Return the numbers of the pages by name, from the JSON of ``prove --only registration``."""
+    """Return the numbers of the pages by name, from the proof of registration's JSON."""
     record = data["registration"]
     largest, surface = _find_largest(record["checks"]), record["surface"]
     return {
@@ -126,7 +128,7 @@ def compute_registration(data: dict[str, Any]) -> dict[str, float]:
 
 
 def compute_edges(data: dict[str, Any]) -> dict[str, float]:
-    """Return the numbers of the pages by name, from the JSON of ``prove --only edges``."""
+    """Return the numbers of the pages by name, from the proof of edges's JSON."""
     rows = {row["scene"]: row for row in data["edges"]["rows"]}
     return {
         f"edges {column} {scene.rpartition(' blur ')[2]}": row[title]
@@ -137,7 +139,7 @@ def compute_edges(data: dict[str, Any]) -> dict[str, float]:
 
 
 def compute_surfaces(data: dict[str, Any]) -> dict[str, float]:
-    """Return the numbers of the pages by name, from the JSON of ``prove --only surfaces``."""
+    """Return the numbers of the pages by name, from the proof of surfaces's JSON."""
     values = {}
     for surface, sequences in data["surfaces"]["surfaces"].items():
         for sequence, errors in sequences.items():
@@ -160,10 +162,10 @@ def _find_largest(checks: Iterable[dict[str, Any]]) -> dict[str, float]:
 
 
 SOURCES: dict[str, tuple[str, Callable[[dict[str, Any]], dict[str, float]]]] = {
-    "accuracy": ("slviewer prove --quick --only accuracy", compute_accuracy),
-    "registration": ("slviewer prove --quick --only registration", compute_registration),
-    "edges": ("slviewer prove --only edges", compute_edges),
-    "surfaces": ("slviewer prove --only surfaces", compute_surfaces),
+    "accuracy": ("python -m tests.proofs accuracy --quick", compute_accuracy),
+    "registration": ("python -m tests.proofs registration --quick", compute_registration),
+    "edges": ("python -m tests.proofs edges", compute_edges),
+    "surfaces": ("python -m tests.proofs surfaces", compute_surfaces),
     "": ("slviewer reproduce --quick", compute_values),
 }
 """{first word of a number's name: the command, some minutes, and the numbers that follow from
@@ -194,16 +196,20 @@ def find_pages() -> list[Path]:
 
 def run(command: str) -> str:
     """Return what a command of slviewer prints, as a block of text."""
-    name, *arguments = shlex.split(command)
-    if name != "slviewer":
-        raise SystemExit(f"{command}: figures come from commands of slviewer")
+    main, arguments = cli.main, shlex.split(command.removeprefix("slviewer "))
+    if command.startswith(PROOFS):
+        sys.path.insert(0, str(ROOT))
+        main = importlib.import_module("tests.proofs.__main__").main
+        arguments = shlex.split(command.removeprefix(PROOFS))
+    elif not command.startswith("slviewer "):
+        raise SystemExit(f"{command}: figures come from commands of slviewer and from proofs")
     printed = io.StringIO()
     with (
         tempfile.TemporaryDirectory() as folder,
         contextlib.chdir(folder),
         contextlib.redirect_stdout(printed),
     ):
-        status = cli.main(arguments)
+        status = main(arguments)
     if status:
         raise SystemExit(f"{command} failed with status {status}")
     return f"\n```text\n{printed.getvalue().rstrip()}\n```\n\n"

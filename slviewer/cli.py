@@ -164,7 +164,6 @@ COMMANDS: dict[str, Callable[[], Function]] = {
         options=("commands.runs:ReproduceOptions", *JSON),
         run=run_reproduce,
     ),
-    "prove": _define_command("validation.prove:prove", options=JSON, names={"cases": "case"}),
     "patterns": _define_command("pipeline.printouts:patterns"),
     "target": _define_command("pipeline.printouts:target", "board"),
     "detect": _define_command(

@@ -13,7 +13,7 @@ from copies import copy_session
 import slviewer as sl
 from slviewer.session.toml import describe_sequence
 from slviewer.simulation.rig import letter
-from slviewer.validation.prove_hostile import BOARD, HostileBench, write_images
+from tests.proofs.hostile import BOARD, HostileBench, write_images
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 

@@ -1,6 +1,6 @@
 """Numbers that the examination of captures decides by, and where each comes from.
 
-"Measured" means on the sound and faulty captures of `slviewer prove --only causes`, and on
+"Measured" means on the sound and faulty captures of `python -m tests.proofs causes`, and on
 photographs of real rigs.
 """
 

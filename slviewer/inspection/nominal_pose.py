@@ -294,12 +294,12 @@ def _list_turned(
         over = 2 * np.diag(np.roll(thin, 1)) - np.eye(3)
         turns = np.concatenate([turns, flat, flat @ over])
     for R in axes @ turns @ axes.T:
-        turned = rigid_transform(R, middle - R @ middle) @ pose.T
-        scan = _Faces(move_points(turned, points) @ axes, either(unknown @ turned[:3, :3].T @ axes))
-        tried += _list_shifted(scan, model, axes, turned, reach / 2)
+        T = rigid_transform(R, middle - R @ middle) @ pose.T
+        scan = _Faces(move_points(T, points) @ axes, either(unknown @ T[:3, :3].T @ axes))
+        tried += _list_shifted(scan, model, axes, T, reach / 2)
     moved = np.concatenate([move_points(T, some) for T in tried])
-    facing = None if own is None else np.concatenate([own @ T[:3, :3].T for T in tried])
-    off = surface.distances(moved, facing, np.eye(4), 2 * reach)[0].reshape(len(tried), -1)
+    turned = None if own is None else np.concatenate([own @ T[:3, :3].T for T in tried])
+    off = surface.distances(moved, turned, np.eye(4), 2 * reach)[0].reshape(len(tried), -1)
     shares, costs = np.isfinite(off).mean(axis=1), _cap(off / reach).mean(axis=1)
     first = (*np.argsort(costs)[: RIVALS // 2], *np.argsort(-shares)[:RIVALS])
     order = [k for k in dict.fromkeys(first) if shares[k] >= RIVAL_SHARE * shares[0]][:RIVALS]

@@ -34,6 +34,8 @@ work."""
 Warn = Callable[[str], None]
 """Called with one sentence that the operator should know of."""
 
+T = TypeVar("T")
+
 
 def ignore_progress(done: float, doing: str) -> None:
     """Ignore the progress."""
@@ -52,6 +54,17 @@ def part(progress: Progress, start: float, end: float, label: str = "") -> Progr
         progress(start + (end - start) * done, f"{label}: {doing}" if label else doing)
 
     return report
+
+
+def track(
+    progress: Progress, named: Mapping[str, T], start: float = 0.0, end: float = 1.0
+) -> Iterator[tuple[str, T, Progress]]:
+    """Yield each item with its name, which is reported, and the progress of its share of ``start``
+    to ``end``."""
+    for i, (name, item) in enumerate(named.items()):
+        begin, after = (start + (end - start) * k / len(named) for k in (i, i + 1))
+        progress(begin, name)
+        yield name, item, part(progress, begin, after, name)
 
 
 def stage(progress: Progress, start: float, end: float, doing: str) -> Callable[[float], None]:

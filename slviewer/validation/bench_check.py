@@ -15,7 +15,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.jit import run_rows
-from slviewer.pipeline.operation import Progress
+from slviewer.pipeline.operation import Progress, track
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.session import atomic
@@ -35,7 +35,6 @@ from slviewer.validation.bench_rows import (
     time_beside,
 )
 from slviewer.validation.bench_scaling import save_scans
-from slviewer.validation.proof import track
 
 LIMITS = {
     "decode, kernel / floor": 3.5,

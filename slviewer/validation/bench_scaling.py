@@ -20,7 +20,7 @@ from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
 from slviewer.pipeline.batch import batch
-from slviewer.pipeline.operation import Progress
+from slviewer.pipeline.operation import Progress, track
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Starts, register_all
@@ -31,7 +31,6 @@ from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.turning import STEPS, turning
 from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import Row, median, row, run_python
-from slviewer.validation.proof import track
 from slviewer.validation.rendered_calibration import observe_rendered, scan_sequence
 from slviewer.wizard.pose_plan import Planner
 from slviewer.wizard.session_reader import SessionReader

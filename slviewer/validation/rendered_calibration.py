@@ -11,14 +11,13 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.operation import Progress
+from slviewer.pipeline.operation import Progress, track
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
-from slviewer.validation.proof import track
 
 
 def calibrate_rendered(

@@ -28,7 +28,7 @@ from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.records.record import render_text
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.validation.prove_accuracy import (
+from tests.proofs.accuracy import (
     PREDICTED_BAND,
     PredictedErrors,
     compare_with_truth,

@@ -14,8 +14,8 @@ from slviewer.examination.ghost import has_ghost, measure_ghost
 from slviewer.examination.sample import sample_capture
 from slviewer.fringe.presets import p18
 from slviewer.simulation.boards import Pose, blank_board
-from slviewer.simulation.hostile import FAULTS, SOUND, expose_frames, render_light
 from slviewer.simulation.rig import letter
+from tests.proofs.hostile_rig import FAULTS, SOUND, expose_frames, render_light
 
 pytestmark = pytest.mark.computes
 

@@ -10,7 +10,7 @@ from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.tolerance import judge_limits
 from slviewer.records.measurement import Quantity
-from slviewer.validation.prove_plan import CASES
+from tests.proofs.plan import CASES
 
 pytestmark = pytest.mark.computes
 

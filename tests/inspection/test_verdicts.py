@@ -14,8 +14,8 @@ from slviewer.inspection.wrong_part import explain_misfit
 from slviewer.records.measurement import ToleranceVerdict
 from slviewer.records.record import from_plain, to_plain
 from slviewer.registration.refusal import WrongPart
-from slviewer.simulation.parts import Part, PartFeature
 from slviewer.surface.shapes import Mesh
+from tests.proofs.drawn_parts import Part, PartFeature
 
 NOISE, TOLERANCE, PLATE = 0.02, 0.2, 5.0
 PIN = PartFeature((18.0, 9.0), (4.0, 4.0), 0.0, 11.0, is_round=True)

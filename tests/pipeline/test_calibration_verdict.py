@@ -27,7 +27,7 @@ from slviewer.pipeline.poses import load_judged
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.validation.prove_causes import BOARD, FaultBench
+from tests.proofs.causes import BOARD, FaultBench
 
 pytestmark = pytest.mark.computes
 

@@ -10,8 +10,8 @@ from facts import missing_facts, raises
 from slviewer.errors import SessionError
 from slviewer.session.nominal import read_nominal
 from slviewer.session.polygons import Polygons, triangulate_polygons
-from slviewer.validation.reports.case import Workplace
-from slviewer.validation.reports.models import CASES
+from tests.proofs.report_cases.case import Workplace
+from tests.proofs.report_cases.models import CASES
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if not name.startswith("3mf")])
