@@ -94,7 +94,7 @@ def list_options() -> str:
         "What `slviewer COMMAND --help` prints, made from the program when this site is built.",
         "",
     ]
-    for name in cli.COMMANDS:
+    for name in cli.find_commands():
         lines += [f"## {name}", "", "```text", read_help(name), "```", ""]
         for layout in (
             re.findall(r"\{([\w,-]+)\}", read_help(name).splitlines()[0])[:1]

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from slviewer.fringe.decode import decode
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import p18
-from slviewer.pipeline.plan_rig import plan_rig
+from slviewer.operations.plan_rig import plan_rig
 
 RIGS = {
     "webcam, pocket projector": ("webcam-1080p", "pocket-720p"),

@@ -52,9 +52,9 @@ if TYPE_CHECKING:
     from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
     from slviewer.fringe.sequence import Frame, PatternSequence, one_axis
     from slviewer.gui.viewer import show
+    from slviewer.operations.batch import batch
     from slviewer.pipeline import datasets
     from slviewer.pipeline.accept import accept, check
-    from slviewer.pipeline.batch import batch
     from slviewer.pipeline.calibrate import (
         CalibrationResult,
         calibrate,
@@ -114,6 +114,7 @@ _EXPORTS = {
     "Verification": "records.verification",
     "align": "pipeline.merge",
     "align_clouds": "registration.multiway:register_all",
+    "batch": "operations.batch",
     "calibrate_frames": "pipeline.calibrate",
     "capture_frames": "devices.capture",
     "check": "pipeline.accept",

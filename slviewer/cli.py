@@ -9,7 +9,6 @@ needs it.
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import MISSING, fields
 from difflib import get_close_matches
 from functools import partial
 from textwrap import fill
@@ -28,6 +27,7 @@ from slviewer.commands.command import (
     Function,
     call,
     read_command,
+    read_operation,
     show_result,
     take_options,
 )
@@ -40,6 +40,7 @@ from slviewer.commands.runs import (
     run_turn,
     wizard,
 )
+from slviewer.entry_points import OPERATIONS, find_sources
 from slviewer.errors import Cancelled, SlviewerError, UsageError
 
 
@@ -101,9 +102,6 @@ COMMANDS: dict[str, Callable[[], Function]] = {
     ),
     "capture": _define_command("pipeline.capture:capture", "name", options=PAGES, run=run_capture),
     "turn": _define_command("pipeline.capture:turn", options=(*PAGES, *JSON), run=run_turn),
-    "plan-rig": _define_command(
-        "pipeline.plan_rig:plan_rig", "camera", "projector", "distance", options=JSON
-    ),
     "import": make_import_command,
     "calibrate": _define_command(
         "pipeline.calibrate:calibrate",
@@ -154,7 +152,6 @@ COMMANDS: dict[str, Callable[[], Function]] = {
         names={"file_format": "format", **MESHING_NAMES},
         run=_run_meshing,
     ),
-    "batch": _define_command("pipeline.batch:batch", "sessions", options=JSON),
     "check": _define_command("pipeline.accept:check", "capture", options=JSON),
     "accept": _define_command("pipeline.accept:accept", options=JSON),
     "fetch": _define_command("pipeline.datasets:fetch", "name", "folder", run=_run_fetch),
@@ -179,24 +176,41 @@ COMMANDS: dict[str, Callable[[], Function]] = {
 
 
 def make_command(name: str) -> Function:
-    """Return the command of that name, also of an operation that is registered in this process,
-    whose settings without defaults are positional. Raises UsageError where there is none."""
-    if name in COMMANDS:
-        return COMMANDS[name]()
-    operation = getattr(sys.modules.get("slviewer.pipeline.operation"), "OPERATIONS", {}).get(name)
-    if operation is None:
-        near = "".join(f" (did you mean {each}?)" for each in get_close_matches(name, COMMANDS, 1))
+    """Return the command of that name, also of another package's operation. Raises UsageError where
+    there is none."""
+    commands = find_commands()
+    if name not in commands:
+        near = "".join(f" (did you mean {each}?)" for each in get_close_matches(name, commands, 1))
         raise UsageError(f"unknown command {name}{near}: `slviewer --help` lists all commands")
-    required = [each.name for each in fields(operation.settings) if each.default is MISSING]
-    source = f"{operation.function.__module__}:{operation.function.__name__}"
-    return read_command(source, *required, options=JSON)
+    return commands[name]()
+
+
+def find_commands() -> dict[str, Callable[[], Function]]:
+    """Return all commands by name, and those of operations that are found by entry points."""
+    sources = find_sources(OPERATIONS).items()
+    found = {name: partial(_make_operation, name, source) for name, source in sources}
+    return COMMANDS | {name: make for name, make in found.items() if name not in COMMANDS}
+
+
+def _make_operation(name: str, source: str) -> Function:
+    """Return the command of an operation. Raises UsageError where its source cannot be read."""
+    try:
+        return read_operation(source)
+    except Exception as error:  # whatever is wrong with a package
+        raise UsageError(
+            f"{name}, of another package, cannot be used ({type(error).__name__}: {error}):"
+            " `slviewer plugins` shows why"
+        ) from error
 
 
 def list_commands() -> str:
     """Return all commands, each with the first paragraph of its description."""
     lines = [DESCRIPTION]
-    for name, make in COMMANDS.items():
-        text = " ".join((make().__doc__ or "").split("\n\n")[0].split())
+    for name, make in find_commands().items():
+        try:
+            text = " ".join((make().__doc__ or "").split("\n\n")[0].split())
+        except UsageError as error:
+            text = str(error)
         lines.append(fill(f"  {name:{INDENT - 2}}{text}", WIDTH, subsequent_indent=" " * INDENT))
     return "\n".join(lines)
 

@@ -7,8 +7,10 @@ from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
-IMPORTERS = "slviewer.importers"
-"""Group of the importers, which the command line lists without importing one."""
+IMPORTERS, OPERATIONS = "slviewer.importers", "slviewer.operations"
+"""Groups of the importers, which the command line lists without importing one, and of operations,
+whose commands it reads from their sources."""
+OWN = "slviewer"
 T = TypeVar("T")
 
 
@@ -29,6 +31,15 @@ def list_names(group: str) -> list[str]:
     return sorted({entry.name for entry in entry_points(group=group)})
 
 
+def find_sources(group: str) -> dict[str, str]:
+    """Return ``module:object`` of a group's entry points by name, slviewer's own first."""
+    entries = sorted(entry_points(group=group), key=lambda entry: (not _is_own(entry), entry.name))
+    sources: dict[str, str] = {}
+    for entry in entries:
+        sources.setdefault(entry.name, entry.value)
+    return sources
+
+
 @dataclass(frozen=True)
 class PluginGroup(Generic[T]):
     """Plugins under the entry points ``name``: objects of ``kind``, called otherwise than what is
@@ -47,7 +58,7 @@ class PluginGroup(Generic[T]):
         it.
         """
         plugins: list[Plugin] = []
-        entries = entry_points(group=self.name)
+        entries = [entry for entry in entry_points(group=self.name) if not _is_own(entry)]
         for entry in sorted(entries, key=lambda entry: (entry.name, _name_package(entry))):
             taken = {*self.built_in(), *(plugin.name for plugin in plugins if not plugin.problem)}
             value, problem = None, f"the name {entry.name} is taken: choose another"
@@ -74,7 +85,7 @@ def _load(entry: EntryPoint, kind: type) -> tuple[Any, str]:
         value = entry.load()
     except Exception as error:  # whatever a package's import raises must not stop the program
         return None, f"its import failed, {type(error).__name__}: {error}"
-    name = getattr(value, "name", None)
+    name = getattr(value, "name", entry.name)
     if not isinstance(value, kind):
         return None, f"{entry.value} is a {type(value).__name__}, not a {kind.__name__}"
     if name != entry.name:
@@ -82,8 +93,21 @@ def _load(entry: EntryPoint, kind: type) -> tuple[Any, str]:
     return value, ""
 
 
+def _is_own(entry: EntryPoint) -> bool:
+    """Whether an entry point is of slviewer itself."""
+    return entry.value.partition(".")[0] == OWN
+
+
 def _name_package(entry: EntryPoint) -> str:
     """Return name and version of the package of an entry point."""
     return (
         f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "unknown package"
     )
+
+
+OPERATION_PLUGINS = PluginGroup[Callable[..., Any]](
+    OPERATIONS,
+    Callable,  # type: ignore[arg-type]
+    lambda: [entry.name for entry in entry_points(group=OPERATIONS) if _is_own(entry)],
+)
+"""Operations of other packages, which register their kinds of records when they are imported."""

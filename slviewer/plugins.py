@@ -1,5 +1,5 @@
-"""What a package needs to add cameras, projectors, turntables, boards, importers and exporters to
-slviewer.
+"""What a package needs to add cameras, projectors, turntables, boards, importers, exporters and
+operations with their panels to slviewer.
 
 A plugin is an object under an entry point, whose name is the object's ``name``:
 
@@ -9,6 +9,8 @@ A plugin is an object under an entry point, whose name is the object's ``name``:
 ``slviewer.importers``   a `FolderLayout`: another program's folders of images, best made by
                          `define_layout`
 ``slviewer.exporters``   an `Exporter`: a file format for points or meshes
+``slviewer.operations``  an operation, made by `operation`, and with it its kind of `Record`
+``slviewer.panels``      a subclass of `PanelPlugin`: a folder in a step of the wizard
 =======================  ===========================================================================
 
 The ``check_...`` functions test one as slviewer uses it, for the tests of its package.
@@ -20,7 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 import numpy as np
 
@@ -39,6 +41,7 @@ from slviewer.devices.protocols import (
     check_sequence,
     stated_full_scale,
 )
+from slviewer.entry_points import OPERATION_PLUGINS
 from slviewer.errors import (
     Cancelled,
     DetectionError,
@@ -51,7 +54,8 @@ from slviewer.fringe.patterns import render_pattern as render
 from slviewer.fringe.presets import complementary, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 from slviewer.pipeline.import_captures import check_imported_capture
-from slviewer.pipeline.operation import ignore_warnings
+from slviewer.pipeline.operation import Found, Job, ignore_warnings, operation
+from slviewer.records.record import Record
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,
@@ -67,15 +71,27 @@ from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import BOARD_PLUGINS, Board, BoardType
 from slviewer.target.detect import detect
 
+if TYPE_CHECKING:
+    from slviewer.gui.panel import PanelPlugin
+
 __all__ = [
     "Board", "BoardType", "Camera", "CameraSettings", "DetectionError", "DeviceError", "Driver",
-    "Exporter", "FolderLayout", "Frame", "ImportableRecording", "InputError", "Mesh", "Openable",
-    "PatternSequence", "PerAxis", "PointSet", "Projector", "Rig", "Turntable", "TurntableError",
+    "Exporter", "FolderLayout", "Found", "Frame", "ImportableRecording", "InputError", "Job",
+    "Mesh", "Openable", "PanelPlugin", "PatternSequence", "PerAxis", "PointSet", "Projector",
+    "Record", "Rig", "Turntable", "TurntableError",
     "check_angle", "check_board", "check_camera", "check_complete", "check_exporter", "check_frame",
     "check_importer", "check_index", "check_level", "check_projector", "check_sequence",
-    "check_turntable", "define_layout", "gray_bits", "has_images", "match_images", "phase_steps",
-    "render", "unknown_files_warning",
+    "check_turntable", "define_layout", "gray_bits", "has_images", "match_images", "operation",
+    "phase_steps", "render", "unknown_files_warning",
 ]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name != "PanelPlugin":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from slviewer.gui.panel import PanelPlugin  # of a second: only panels need it
+
+    return PanelPlugin
 
 
 _SEEN_LEVEL, _OTHER_LEVEL = 85, 170
@@ -345,11 +361,17 @@ def _expect(
 
 
 def plugins() -> str:
-    """List the plugins: drivers, boards, importers and exporters that other packages add.
+    """List the plugins: drivers, boards, importers, exporters, operations and panels that other
+    packages add.
 
     Ends with status 1 where one cannot be used, and states why.
     """
-    groups = (DRIVER_PLUGINS, BOARD_PLUGINS, LAYOUT_PLUGINS, EXPORTER_PLUGINS)
+    from slviewer.gui.panel import PANEL_PLUGINS
+
+    groups = (
+        *(DRIVER_PLUGINS, BOARD_PLUGINS, LAYOUT_PLUGINS, EXPORTER_PLUGINS),
+        *(OPERATION_PLUGINS, PANEL_PLUGINS),
+    )
     found = [plugin for group in groups for plugin in group.plugins]
     if not found:
         return "no plugins are installed"

@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 from chromium import launched
 from clocks import HANG_S
+from example_plugin import example, install  # noqa: F401 (fixtures)
 from filelock import FileLock
 from numba.core import event
 from playwright.sync_api import Browser, sync_playwright

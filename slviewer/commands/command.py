@@ -10,9 +10,8 @@ import ast
 import inspect
 import json
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import KW_ONLY, dataclass, fields, is_dataclass
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -62,6 +61,7 @@ RANGES: dict[str, tuple[float, float]] = {
 }
 """Of the numbers that a command takes, by its parameter, where they are narrower."""
 JSON = ("commands.command:JsonFile",)
+PACKAGE = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def read_command(
     description: str = "",
     run: Run | None = None,
 ) -> Command:
-    """Return the command of the function ``module:function`` of slviewer, or of a module in use,
+    """Return the command of the function ``module:function`` of slviewer, or of another package,
     for tyro.
 
     The command's value is the work to do once all arguments are parsed.
@@ -138,6 +138,23 @@ def read_command(
     parse.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     parse.__annotations__ = {each.name: each.annotation for each in parameters}
     return parse
+
+
+def read_operation(source: str) -> Command:
+    """Return the command of an operation ``module:function``. What has no default is positional, up
+    to the first of several values."""
+    module, name = _find_module(source)
+    _, (_, accepted) = _read_function(module, name)
+    positional = []
+    for argument, default, place in accepted:
+        assert argument.annotation is not None
+        kind = place.evaluate(argument.annotation)
+        if default is not None or kind is KW_ONLY:
+            break
+        positional.append(argument.arg)
+        if getattr(kind, "__origin__", None) is Sequence:
+            break
+    return read_command(source, *positional, options=JSON)
 
 
 def take_options(arguments: Arguments, kind: type[T]) -> T:
@@ -214,9 +231,10 @@ Described = tuple[str, list[Argument]]
 
 
 def _find_module(source: str) -> tuple["_Module", str]:
-    """Return module and name of ``module:name``, of slviewer or of a module in use."""
+    """Return module and name of ``module:name``, of slviewer's where it has that one."""
     module, _, name = source.partition(":")
-    return _read_module(module if module in sys.modules else f"slviewer.{module}"), name
+    own = PACKAGE / f"{module.replace('.', '/')}.py"
+    return _read_module(f"{PACKAGE.name}.{module}" if own.exists() else module), name
 
 
 _STATEMENT = re.compile(

@@ -16,6 +16,7 @@ import viser
 
 from slviewer.devices.browser import PageChannels, PageRole
 from slviewer.devices.page_channel import PageState
+from slviewer.entry_points import PluginGroup
 from slviewer.errors import InputError, SlviewerError, hide_passwords
 from slviewer.gui.hints import HINTS
 from slviewer.gui.scene import Colour, ViewerScene, Viewpoints
@@ -515,6 +516,14 @@ class StepPanel(ControlGroup):
         """Whether the step can be done, and has no result yet."""
         return self.snapshot.step(self.key).state == "ready"
 
+    def add_plugin(self, plugin: type["PanelPlugin"]) -> None:
+        """Add a panel of another package at the end; one that cannot be built is reported."""
+        try:
+            with self._container, self._gui.add_folder(plugin.title, expand_by_default=False):
+                plugin(self)
+        except Exception as error:  # whatever a package's panel raises must not stop the program
+            self.context.report_failure(error)
+
     def show_points(self, name: str, points: np.ndarray | None) -> None:
         """Move the browsers' views to what is shown now, points (..., 3) mm, or once the panel is
         visible."""
@@ -568,6 +577,21 @@ class PanelPart(ControlGroup):
     def redraw(self) -> None:
         """Draw the panel."""
         self.panel.redraw()
+
+
+class PanelPlugin(PanelPart):
+    """Base of the panels of other packages: a folder at the end of the ``step``, called ``title``.
+
+    ``name``: that of its entry point. ``build`` creates its inputs, ``draw`` shows the session's
+    records in ``self.panel.session``, and ``self._operator.run(operation, ...)`` runs an operation.
+    """
+
+    name: ClassVar[str]
+    step: ClassVar[str]
+    title: ClassVar[str]
+
+
+PANEL_PLUGINS = PluginGroup[type]("slviewer.panels", type, lambda: ())
 
 
 class RestoreButton(PanelPart):

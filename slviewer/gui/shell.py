@@ -17,7 +17,14 @@ import numpy as np
 import viser
 
 from slviewer.calibration.next_pose import nominal_lens
-from slviewer.gui.panel import NO_SESSION, ControlGroup, PanelContext, StepPanel
+from slviewer.gui.panel import (
+    NO_SESSION,
+    PANEL_PLUGINS,
+    ControlGroup,
+    PanelContext,
+    PanelPlugin,
+    StepPanel,
+)
 from slviewer.gui.scene import CAMERA, PROJECTOR, SceneLayer
 from slviewer.gui.start import START, StartPanel
 from slviewer.gui.undo_controls import UndoControls
@@ -218,6 +225,9 @@ class Shell(ControlGroup):
             for key in (step.key for step in steps):
                 module = importlib.import_module(f"slviewer.gui.steps.{key}")
                 self._panels[key] = getattr(module, f"{key.title()}Panel")(self.context)
+            for plugin in PANEL_PLUGINS.usable().values():
+                added: type[PanelPlugin] = plugin
+                self._panels[added.step].add_plugin(added)
         with panel.add_tab("Session"):
             self._session = Text(gui)
             links = gui.add_button(

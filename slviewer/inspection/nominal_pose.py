@@ -55,6 +55,9 @@ EXACT_AGREEMENT = 0.995
 GOOD_OVERLAP, MOST_OVERLAP, GOOD_AGREEMENT, NEAR = 0.6, 0.9, 0.95, 5.0
 """Shares of the scan that lie on the nominal of a likely pose, and of one than which no better is
 searched for; there fit well so many of its points within so many reaches of the nominal."""
+FAULTY_OVERLAP = 0.5
+"""Share of the scan on the nominal of a pose at which a bent part, or one of another size, is
+judged."""
 PATIENCE, MOST_PATIENCE, BETTER_COST = 3, 8, 0.95
 """Sides searched without a pose of so much lower cost, after one whose points do not all fit well:
 a part with an error has no better one; more where hardly half of them fit."""
@@ -486,7 +489,7 @@ def _settle(
 
 def _refuse_if_doubtful(pose: NominalPose) -> None:
     """Raise ``Refused`` for a pose that does not fit."""
-    is_likely = pose.overlap >= GOOD_OVERLAP  # a bent part; its deviations say so
+    is_likely = pose.overlap >= FAULTY_OVERLAP
     if pose.overlap < LEAST_OVERLAP or (pose.agreement < LEAST_AGREEMENT and not is_likely):
         raise Refused(
             "disagree",

@@ -36,7 +36,7 @@ from slviewer.pipeline.operation import (
 )
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.records.calibration import ModelCalibration, StereoFit
-from slviewer.records.kinds import RECORDS
+from slviewer.records.kinds import all_kinds
 from slviewer.records.record import Column, Record, Rows, Table, format_count
 from slviewer.report.page import CERTIFICATE, Section, page_digest, split_page
 from slviewer.session.atomic import to_json
@@ -157,7 +157,7 @@ def collect_figures(store: Session) -> Figures:
     """Return the figures of the records that are fresh."""
     return {
         f"{kind.kind}/{each.name}": figures
-        for kind in RECORDS.values()
+        for kind in all_kinds().values()
         for each in list_records(store, kind)
         if not each.stale and (figures := each.record.figures())
     }
@@ -338,10 +338,10 @@ class _Repetition:
         runs: dict[tuple[str, bytes], dict[str, Record]] = {}
         for result in self.certificate.figures:
             kind, _, name = result.partition("/")
-            if kind not in RECORDS or kind == ModelCalibration.kind:
+            if kind not in all_kinds() or kind == ModelCalibration.kind:
                 continue
             with self._note_failure(result):
-                record = load_record(self.store, RECORDS[kind], name)
+                record = load_record(self.store, all_kinds()[kind], name)
                 if record.operation not in OPERATIONS:
                     raise InputError(
                         "an older version of slviewer made it: make it again, and write the report"
@@ -356,7 +356,9 @@ class _Repetition:
             operation, (record, *_) = OPERATIONS[name], records.values()
             # the session is read alone: its files stay as they are
             with self._note_failure(*records), Session.open(self.fresh.folder) as reading:
-                made_from = (each for each in record.inputs if each.partition("/")[0] in RECORDS)
+                made_from = (
+                    each for each in record.inputs if each.partition("/")[0] in all_kinds()
+                )
                 if missing := [each for each in made_from if not reading.has_result(each)]:
                     raise InputError(
                         f"{', '.join(missing)}, which it was made from, is not made again"

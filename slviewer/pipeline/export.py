@@ -44,7 +44,7 @@ from slviewer.pipeline.report import report
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals
-from slviewer.records.kinds import RECORDS
+from slviewer.records.kinds import all_kinds
 from slviewer.records.merge import Merge
 from slviewer.records.record import Value
 from slviewer.session.atomic import arriving_file, format_bytes, replace_file
@@ -303,7 +303,7 @@ def write_table(store: Session, path: Path) -> None:
     """Write the tables of all records as one CSV: a line for each of theirs, the kind and whether
     it is up to date."""
     rows: list[dict[str, Value]] = []
-    for each in (each for kind in RECORDS.values() for each in list_records(store, kind)):
+    for each in (each for kind in all_kinds().values() for each in list_records(store, kind)):
         start = {
             "kind": each.record.kind,
             "record": each.name,

@@ -22,7 +22,7 @@ from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
 from slviewer.pipeline.cloud_corrections import scale_factor
 from slviewer.pipeline.imported_verdict import warning_of_imported
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.kinds import RECORDS
+from slviewer.records.kinds import all_kinds
 from slviewer.records.record import Meta, Record, from_plain, render_text, to_plain
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
@@ -247,10 +247,10 @@ def is_up_to_date(store: Session, result: str) -> bool:
     """Whether a record's inputs are as they were, and no correction of scale has changed since,
     also in records that it was made from; other results are taken to be."""
     kind, _, name = result.partition("/")
-    if kind not in RECORDS:
+    if kind not in all_kinds():
         return True
     is_fresh = store.state_of(result) == "fresh"
-    return is_fresh and _has_scales(store, load_record(store, RECORDS[kind], name))
+    return is_fresh and _has_scales(store, load_record(store, all_kinds()[kind], name))
 
 
 def _has_scales(store: Session, record: Record) -> bool:
@@ -258,9 +258,9 @@ def _has_scales(store: Session, record: Record) -> bool:
     force; calibrations are made without any."""
     made_from = (each.partition("/") for each in record.inputs)
     return all(scale_factor(store, model) == used for model, used in record.scales.items()) and all(
-        _has_scales(store, load_record(store, RECORDS[kind], name))
+        _has_scales(store, load_record(store, all_kinds()[kind], name))
         for kind, _, name in made_from
-        if kind in RECORDS and kind != ModelCalibration.kind
+        if kind in all_kinds() and kind != ModelCalibration.kind
     )
 
 

@@ -51,7 +51,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals
 from slviewer.records.acceptance import AcceptanceTest, Drift
 from slviewer.records.inspection import Inspection
-from slviewer.records.kinds import RECORDS
+from slviewer.records.kinds import all_kinds
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Merge, Reconstruction
 from slviewer.records.record import Record, format_count
@@ -258,7 +258,7 @@ def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
     """Return the records made from what the session holds now, by kind, with pictures of the first
     ones; and warnings of the others."""
     views, stale = [], []
-    for kind in RECORDS.values():
+    for kind in all_kinds().values():
         every = list_records(store, kind)
         fresh = [each for each in every if kind.is_history or not each.stale]
         stale += [

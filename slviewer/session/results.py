@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError
-from slviewer.records.kinds import RECORDS
+from slviewer.records.kinds import all_kinds
 from slviewer.records.record import Count, Vector, from_plain
 from slviewer.records.verdict import Examination
 from slviewer.session.atomic import to_json, write_bytes
@@ -180,7 +180,7 @@ def check_meta(name: str, meta: Mapping[str, Any]) -> None:
     holds."""
     name = RENAMED.get(name, name)
     from_plain(meta, _TYPES.get(name) or _TYPES.get(name.partition("/")[0]) or ResultMeta)
-    if (kind := RECORDS.get(name.partition("/")[0])) is not None:
+    if (kind := all_kinds().get(name.partition("/")[0])) is not None:
         from_plain(kind.upgrade(meta), kind)
 
 

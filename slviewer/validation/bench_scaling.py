@@ -19,7 +19,7 @@ from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
-from slviewer.pipeline.batch import batch
+from slviewer.operations.batch import batch
 from slviewer.pipeline.operation import Progress, track
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud

@@ -35,7 +35,7 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.operation import Stored, captures_of, load_record, load_stored
 from slviewer.records.calibration import ModelCalibration
-from slviewer.records.kinds import RECORDS
+from slviewer.records.kinds import all_kinds
 from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Placement, Reconstruction
 from slviewer.records.record import format_count, format_counts
@@ -357,8 +357,8 @@ class SessionReader:
         """Read all records of existing captures, with whether they are stale."""
         for result in self.session.result_names():
             kind, _, name = result.partition("/")
-            if kind in RECORDS:
-                stored = self._attempt(result, load_stored, self.session, RECORDS[kind], name)
+            if kind in all_kinds():
+                stored = self._attempt(result, load_stored, self.session, all_kinds()[kind], name)
                 if stored and self._captures.keys() >= set(captures_of(name, stored.record)):
                     yield stored
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from slviewer.cli import COMMANDS, main
+from slviewer.cli import find_commands, main
 from slviewer.commands.command import _Module
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.rig import letter
@@ -16,9 +16,9 @@ from slviewer.validation.bench_scaling import save_scans
 
 CODE = """
 import sys
-from slviewer.cli import COMMANDS, main
+from slviewer.cli import find_commands, main
 
-helps = ([name, "--help"] for name in COMMANDS)
+helps = ([name, "--help"] for name in find_commands())
 for arguments in (["--version"], ["--help"], ["import", "p18", "--help"], *helps):
     assert main(arguments) == 0, arguments
     heavy = {"numpy", "numba", "scipy", "cv2", "open3d", "viser", "matplotlib", "zarr"}
@@ -43,7 +43,7 @@ def test_help_imports_nothing_heavy_and_lists_every_command() -> None:
     run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     listing = run.stdout[: run.stdout.index("usage: slviewer import")]
-    assert all(f"\n  {name} " in listing for name in COMMANDS)
+    assert all(f"\n  {name} " in listing for name in find_commands())
 
 
 def test_a_command_has_the_arguments_that_its_functions_docstring_describes(
@@ -54,7 +54,7 @@ def test_a_command_has_the_arguments_that_its_functions_docstring_describes(
     assert {"--reference", "--start", "--json"} <= set(said.split())
     assert not {"--picked", "--keep-background", "--progress"} & set(said.split())
     assert "three or more points" not in said  # what is behind the arguments is for Python
-    merge = inspect.signature(COMMANDS["merge"]()).parameters
+    merge = inspect.signature(find_commands()["merge"]()).parameters
     assert (
         merge["captures"].annotation.__origin__ == tuple[str, ...]
         and merge["model"].default is None

@@ -5,68 +5,23 @@ import os
 import shutil
 import subprocess
 import sys
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from example_plugin import PACKAGE, Install
 from facts import missing_facts
 
-from slviewer.devices.drivers import DRIVER_PLUGINS, drivers
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.session.importers.layouts import LAYOUT_PLUGINS
-from slviewer.session.mesh_files import EXPORTER_PLUGINS, write_shape
+from slviewer.session.mesh_files import write_shape
 from slviewer.surface.shapes import PointSet
-from slviewer.target.board import BOARD_PLUGINS, Board
+from slviewer.target.board import Board
 
-PACKAGE = Path(__file__).parents[2] / "docs" / "examples" / "slviewer-example-plugin"
-GROUPS = (DRIVER_PLUGINS, LAYOUT_PLUGINS, EXPORTER_PLUGINS, BOARD_PLUGINS)
 Run = Callable[..., tuple[int, str, str]]
-Install = Callable[[str, str, str], None]
-
-
-def forget_plugins() -> None:
-    """Let the plugins be read anew when they are next used."""
-    for group in GROUPS:
-        vars(group).pop("plugins", None)
-    drivers.cache_clear()
-
-
-@pytest.fixture
-def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Install a package in this process until the test ends: write its metadata, as pip does, into
-    a folder.
-
-    The package's modules are in that folder, ``site`` of ``tmp_path``, or beside it on the path.
-    """
-
-    def write(name: str, version: str, entry_points: str) -> None:
-        info = tmp_path / "site" / f"{name}-{version}.dist-info"
-        info.mkdir(parents=True)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-        (info / "entry_points.txt").write_text(entry_points)
-        monkeypatch.syspath_prepend(str(tmp_path / "site"))
-        forget_plugins()
-
-    monkeypatch.chdir(tmp_path)
-    yield write
-    monkeypatch.undo()
-    forget_plugins()
-
-
-@pytest.fixture
-def example(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The example plugin is installed in this process."""
-    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text("utf-8"))["project"]
-    lines = []
-    for group, entries in project["entry-points"].items():
-        lines += [f"[{group}]", *(f"{name} = {value}" for name, value in entries.items())]
-    install(project["name"], project["version"], "\n".join(lines))
-    monkeypatch.syspath_prepend(str(PACKAGE))
 
 
 @pytest.mark.slow
@@ -105,7 +60,7 @@ def test_the_plugin_installs_without_network_and_passes_its_own_tests(tmp_path: 
     assert not missing_facts(printed, *ENTRIES, "slviewer-example-plugin 1.0")
 
 
-ENTRIES = ("hotfolder", "tcpturntable", "aprilgrid", "axisfolders", "pts")
+ENTRIES = ("hotfolder", "tcpturntable", "aprilgrid", "axisfolders", "pts", "brightness")
 
 
 def test_its_parts_are_listed(example: None, run: Run) -> None:

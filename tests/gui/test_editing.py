@@ -20,6 +20,7 @@ from wizard_page import (
     cut_labels,
     field,
     new_page,
+    unfold,
     wait_until,
     wait_until_still,
 )
@@ -126,11 +127,6 @@ def wizard(
     choose(opened.page, "Scan", "one")
     expect(opened.page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
     return opened, app, operator, views
-
-
-def unfold(page: Page, folder: str) -> None:
-    """Open a folder of the panel, which is closed at first."""
-    page.get_by_text(folder, exact=True).click()
 
 
 def to_screen(app: App, page: Page, point: np.ndarray) -> tuple[float, float]:

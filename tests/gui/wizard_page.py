@@ -164,6 +164,11 @@ def click(page: Page, name: str) -> None:
     button(page, name).click()
 
 
+def unfold(page: Page, folder: str) -> None:
+    """Open a folder of the panel, which is closed at first."""
+    page.get_by_text(folder, exact=True).click()
+
+
 def field(page: Page, label: str) -> Locator:
     """The input beside this label, which the page may name so: viser's labels are text, as titles
     of tables are, without a tie to their input."""

@@ -22,7 +22,7 @@ from slviewer.cli import main
 from slviewer.errors import Cancelled, SlviewerError, UsageError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.batch import batch, connect
+from slviewer.operations.batch import batch, connect
 from slviewer.pipeline.reconstruct import reconstruct, verify
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.records.record import to_plain

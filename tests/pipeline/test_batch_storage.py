@@ -4,7 +4,7 @@ way."""
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from slviewer.pipeline.batch import export_folder, remove_leftovers
+from slviewer.operations.batch import export_folder, remove_leftovers
 
 BATCH = "0a1b2c3d"
 WORKERS, EACH = 4, 150

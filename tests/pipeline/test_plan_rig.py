@@ -8,7 +8,7 @@ from facts import missing_facts, raises
 
 from slviewer.cli import main
 from slviewer.errors import InputError
-from slviewer.pipeline.plan_rig import (
+from slviewer.operations.plan_rig import (
     PlannedLight,
     _read_camera,
     _read_projector,
@@ -48,7 +48,7 @@ def test_the_simulation_measures_what_is_predicted(camera, projector, distance, 
 def predict(*given):
     """The plan, its usable range looked for at the distance alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("slviewer.pipeline.plan_rig._DEPTHS", np.ones(1))
+        patch.setattr("slviewer.operations.plan_rig._DEPTHS", np.ones(1))
         return predict_rig(*given)
 
 

@@ -29,7 +29,7 @@ from slviewer.pipeline.export import (
     formats,
 )
 from slviewer.pipeline.mesh import BOARD
-from slviewer.records.kinds import RECORDS
+from slviewer.records.kinds import all_kinds
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import mesh_formats, point_formats, read_mesh_file
 from slviewer.session.report_details import FIELDS, ReportDetails
@@ -205,7 +205,9 @@ class ExportPanel(StepPanel):
         self._figures_folder.visible = bool(session.records)
         if session is not self._drawn:
             self._drawn, labels = session, scan_labels(session)
-            tables = (records_html(session.list_records(kind), labels) for kind in RECORDS.values())
+            tables = (
+                records_html(session.list_records(kind), labels) for kind in all_kinds().values()
+            )
             self._figures.set("".join(tables))
         self._request_cloud()
         self._describe_shape()

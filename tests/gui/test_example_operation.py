@@ -1,70 +1,34 @@
-"""An operation of a dozen lines is a command, a function and a job, and its figure is in every
-view."""
+"""An operation of another package is a command, a function, a job and a panel, and its figure is in
+every view."""
 
 import csv
 import json
 import shutil
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
 import pytest
 from clocks import HANG_S
 from copies import copy_session
 from playwright.sync_api import Browser, expect
-from wizard_page import CALM, click, new_page
+from wizard_page import CALM, choose, click, new_page, unfold, wait_until
 
 from slviewer.cli import main
 from slviewer.gui.app import App
 from slviewer.pipeline.certificate import read_certificate, verify_report
-from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.operations import OPERATIONS
-from slviewer.records.kinds import RECORDS
-from slviewer.records.record import Record
 from slviewer.server.secure import Serving
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 
-
-class Brightness(Record, frozen=True, kw_only=True):
-    """How bright captures are."""
-
-    kind: ClassVar[str] = "brightness"
-    title: ClassVar[str] = "Brightness"
-    mean_percent: float
+pytestmark = pytest.mark.usefixtures("example")
+SCAN = "object_r1"
 
 
-@dataclass(frozen=True)
-class BrightnessSettings:
-    """What is measured.
-
-    Args:
-        capture: Name of the capture.
-    """
-
-    capture: str
-
-
-@operation("brightness", Brightness, BrightnessSettings)
-def brightness(job: Job, settings: BrightnessSettings) -> Iterator[Found[Brightness]]:
-    """Measure how bright a capture is."""
-    capture = job.store.load_capture(settings.capture)
-    mean = 100 * float(capture.frames.mean()) / 255
-    yield Found(
-        capture.name, Brightness(mean_percent=mean, inputs=job.store.input_hashes(capture.name))
-    )
-
-
-del OPERATIONS["brightness"]  # every worker imports this file, whichever tests it runs
-
-
-@pytest.fixture(autouse=True)
-def registered() -> Iterator[None]:
-    """Other tests do not see the kind and the operation of this file."""
-    RECORDS["brightness"], OPERATIONS["brightness"] = Brightness, brightness
-    yield
-    del RECORDS["brightness"], OPERATIONS["brightness"]
+def import_operation() -> Any:
+    """The module of the operation, imported anew for each test."""
+    return import_module("slviewer_example.brightness")
 
 
 @pytest.fixture
@@ -80,44 +44,51 @@ def session(recorded: Path, tmp_path: Path) -> Path:
 def test_terminal_json_csv_report_and_certificate_hold_the_figure(
     session: Path, tmp_path: Path, run: Callable[..., tuple[int, str, str]]
 ) -> None:
-    status, out, _ = run("brightness", session, "object_r1", "--json", tmp_path / "found.json")
-    record = json.loads((tmp_path / "found.json").read_text())["brightness"]["object_r1"]
+    status, out, _ = run("brightness", session, SCAN, "--json", tmp_path / "found.json")
+    record = json.loads((tmp_path / "found.json").read_text())["brightness"][SCAN]
     shown = f"{record['mean_percent']:.1f}"
     assert status == 0 and shown in out and "%" in out and 5 < record["mean_percent"] < 95
     assert main(["export", str(session), "table", "--out", str(tmp_path / "figures.csv")]) == 0
     (row,) = csv.DictReader((tmp_path / "figures.csv").read_text().splitlines())
-    assert row["record"] == "object_r1" and float(row["mean %"]) == record["mean_percent"]
+    assert row["record"] == SCAN and float(row["mean %"]) == record["mean_percent"]
     report = tmp_path / "report.html"
     assert main(["report", str(session), "--out", str(report)]) == 0
     page = report.read_text()
     assert "Brightness" in page and "How bright captures are." in page and f">{shown}<" in page
-    assert read_certificate(report)[1].figures["brightness/object_r1"] == {
+    assert read_certificate(report)[1].figures[f"brightness/{SCAN}"] == {
         "mean_percent": record["mean_percent"]
     }
     states = {check.what: check.state for check in verify_report(session, report).checks}
-    assert states["brightness/object_r1"] == "same"
+    assert states[f"brightness/{SCAN}"] == "same"
 
 
 @pytest.mark.computes
 @pytest.mark.slow
 def test_python_and_wizard_store_what_the_terminal_does(session: Path, tmp_path: Path) -> None:
     again = copy_session(session, tmp_path / "again")
-    (found,) = brightness(session, "object_r1").values()
+    module = import_operation()
+    (found,) = module.brightness(session, SCAN).values()
     with Operator(again) as operator:
-        assert operator.run("brightness", capture="object_r1")
+        assert operator.run("brightness", capture=SCAN)
         view = operator.wait_until_idle(HANG_S).session
-        assert view is not None and [each.record for each in view.list_records(Brightness)] == [
-            found
-        ]
+        assert view is not None
+        assert [each.record for each in view.list_records(module.Brightness)] == [found]
     with Session.open(session) as one, Session.open(again) as other:
-        assert one.load_result("brightness/object_r1") == other.load_result("brightness/object_r1")
+        assert one.load_result(f"brightness/{SCAN}") == other.load_result(f"brightness/{SCAN}")
 
 
-def test_the_page_shows_the_figure(session: Path, browser: Browser) -> None:
-    (found,) = brightness(session, "object_r1").values()
+def test_its_panel_measures_and_the_page_shows_the_figure(session: Path, browser: Browser) -> None:
     with Operator(session, timing=CALM) as operator:
         wizard, page = App(operator, Serving(port=0)), new_page(browser)
         page.goto(wizard.server.link())
+        click(page, "6. Scan")
+        unfold(page, "Brightness")
+        choose(page, "Capture", SCAN)
+        click(page, "Measure brightness")
+        brightness = import_operation().Brightness
+        wait_until(page, lambda: bool(operator.snapshot().session.list_records(brightness)))  # type: ignore[union-attr]
+        (found,) = (each.record for each in operator.snapshot().session.list_records(brightness))  # type: ignore[union-attr]
+        expect(page.get_by_text(f"{SCAN}: {found.mean_percent:.1f} %")).to_be_visible()
         click(page, "9. Export")
         page.get_by_text("Figures", exact=True).click()
         expect(page.get_by_text("Brightness").first).to_be_visible()
