@@ -66,7 +66,7 @@ from slviewer.session.importers.imported import (
     unknown_files_warning,
 )
 from slviewer.session.importers.layouts import LAYOUT_PLUGINS
-from slviewer.session.mesh_files import EXPORTER_PLUGINS, Exporter
+from slviewer.session.shape_files import EXPORTER_PLUGINS, Exporter
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import BOARD_PLUGINS, Board, BoardType
 from slviewer.target.detect import detect

@@ -19,7 +19,7 @@ def forget_plugins() -> None:
     from slviewer.pipeline.operation import OPERATIONS
     from slviewer.records.record import RECORDS
     from slviewer.session.importers.layouts import LAYOUT_PLUGINS
-    from slviewer.session.mesh_files import EXPORTER_PLUGINS
+    from slviewer.session.shape_files import EXPORTER_PLUGINS
     from slviewer.target.board import BOARD_PLUGINS
 
     groups = (

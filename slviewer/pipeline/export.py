@@ -49,16 +49,15 @@ from slviewer.records.merge import Merge
 from slviewer.records.record import Value
 from slviewer.session.atomic import arriving_file, format_bytes, replace_file
 from slviewer.session.exporters import write_calibration
-from slviewer.session.mesh_files import (
-    IN_WORDS,
+from slviewer.session.names import natural_key
+from slviewer.session.reading import expand_user
+from slviewer.session.shape_files import (
+    all_formats,
     estimated_bytes,
-    exporters,
     mesh_formats,
     point_formats,
     write_shape,
 )
-from slviewer.session.names import natural_key
-from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import PointSet
@@ -364,7 +363,7 @@ def formats(what: What) -> tuple[str, ...]:
     if what in ("cloud", "merge"):
         return point_formats()
     if what in _MESHES:
-        return tuple(each for each in mesh_formats() if each != "xyz")
+        return mesh_formats()
     if what in _DOCUMENT_FORMATS:
         return _DOCUMENT_FORMATS[what]
     raise InputError(f"{what!r} cannot be exported: choose one of {', '.join(get_args(What))}")
@@ -386,8 +385,8 @@ class Exported:
 
 def describe_format(file_format: str) -> str:
     """Describe what a format contains and in which units."""
-    added = exporters().get(file_format)
-    return added.what if added else IN_WORDS.get(file_format) or DOCUMENTS.get(file_format, "")
+    shape = all_formats().get(file_format)
+    return shape.what if shape else DOCUMENTS.get(file_format, "")
 
 
 def estimate_file_bytes(
@@ -438,8 +437,8 @@ class ExportSettings(Callbacks):
             of coefficients.
         out: The file, whose suffix selects the format, or a folder; by default the session's
             exports.
-        file_format: ply, stl, obj, glb, 3mf, xyz, e57, yml, xml, json, ..., where --out is a folder
-            or not given.
+        file_format: ply, stl, obj, glb, 3mf, xyz, pcd, e57, yml, xml, json, ..., where --out is a
+            folder or not given.
         model: Which calibration to make a cloud with, by default the one of the stored cloud, or
             the best; or which to write (of splined the pinhole and Brown lenses that come nearest,
             and their remaining error).
@@ -465,8 +464,8 @@ class ExportSettings(Callbacks):
 
 @takes_settings(ExportSettings)
 def export(settings: ExportSettings) -> Exported:
-    """Write a file for other programs: shapes in mm (.ply .stl .obj .3mf .xyz) or m (.glb .e57),
-    calibration, poses."""
+    """Write a file for other programs: points and meshes in mm, or in the unit that the format
+    demands, calibration, poses."""
     what = settings.what
     with opened(settings.session) as store:
         chosen = settings.file_format.lower().removeprefix(".")

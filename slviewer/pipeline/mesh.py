@@ -38,7 +38,7 @@ from slviewer.pipeline.reconstruct import (
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge
 from slviewer.session.capture import Capture
-from slviewer.session.mesh_files import write_shape, write_textured
+from slviewer.session.shape_files import write_shape, write_textured
 from slviewer.session.store import Session
 from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh
 from slviewer.surface.shapes import PointSet

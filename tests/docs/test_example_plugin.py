@@ -17,7 +17,7 @@ from facts import missing_facts
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.session.mesh_files import write_shape
+from slviewer.session.shape_files import write_shape
 from slviewer.surface.shapes import PointSet
 from slviewer.target.board import Board
 

@@ -32,7 +32,7 @@ from slviewer.session.importers.imported import (
     match_images,
 )
 from slviewer.session.importers.layouts import BUILT_IN, detect_layout, layouts
-from slviewer.session.mesh_files import Exporter
+from slviewer.session.shape_files import Exporter
 from slviewer.simulation.rig import letter
 from slviewer.target.board import EXAMPLES
 

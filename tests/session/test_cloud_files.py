@@ -11,8 +11,8 @@ import trimesh
 from slviewer.errors import SlviewerError
 from slviewer.registration.open3d_loader import open3d, point_cloud
 from slviewer.session.importers.clouds import ReadCloud, read_cloud, unit_warning
-from slviewer.session.mesh_files import write_shape
 from slviewer.session.ply import write_ply
+from slviewer.session.shape_files import write_shape
 from slviewer.surface.shapes import PointSet
 
 RNG = np.random.default_rng(0)
@@ -78,6 +78,21 @@ def test_nan_and_repeated_points_are_dropped_and_counted(tmp_path: Path) -> None
     assert len(cloud.points) == len(POINTS)
     assert "7 of 312" in cloud.notes[0]
     assert "5 of 305" in cloud.notes[1]
+
+
+@pytest.mark.parametrize("has_normals", [True, False])
+@pytest.mark.parametrize("form", ["ascii", "binary", "compressed"])
+def test_colours_are_read_from_every_pcd(tmp_path: Path, form: str, has_normals: bool) -> None:
+    cloud = open3d().geometry.PointCloud(open3d().utility.Vector3dVector(POINTS))
+    colours = np.random.default_rng(1).integers(0, 256, POINTS.shape).astype(np.uint8)
+    cloud.colors = open3d().utility.Vector3dVector(colours / 255)
+    if has_normals:
+        cloud.normals = open3d().utility.Vector3dVector(np.tile([0.0, 0.6, 0.8], (len(POINTS), 1)))
+    file, options = tmp_path / "a.pcd", {"write_ascii": form == "ascii"}
+    open3d().io.write_point_cloud(str(file), cloud, compressed=form == "compressed", **options)
+    found = read(file)
+    assert np.array_equal(found.colours, colours)
+    assert (found.normals is not None) == has_normals
 
 
 def test_place_of_the_scanner_is_read_from_pcd(tmp_path: Path) -> None:

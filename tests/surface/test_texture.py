@@ -14,7 +14,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.open3d_loader import open3d
-from slviewer.session.mesh_files import write_textured
+from slviewer.session.shape_files import write_textured
 from slviewer.surface.shapes import Mesh
 from slviewer.surface.texture import TexturedMesh, texture_mesh
 

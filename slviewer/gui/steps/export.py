@@ -31,8 +31,8 @@ from slviewer.pipeline.export import (
 from slviewer.pipeline.mesh import BOARD
 from slviewer.records.kinds import all_kinds
 from slviewer.session.atomic import format_bytes
-from slviewer.session.mesh_files import mesh_formats, point_formats, read_mesh_file
 from slviewer.session.report_details import FIELDS, ReportDetails
+from slviewer.session.shape_files import mesh_formats, point_formats, read_mesh_file
 from slviewer.surface.meshing import MeshingPlan, Method
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import ExportView, SessionView

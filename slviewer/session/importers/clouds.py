@@ -1,38 +1,33 @@
-"""Clouds and meshes that other scanners made, as points in millimetres: PLY, PCD, E57, text with x
-y z and more a line, and the meshes that `session.nominal` reads.
+"""Clouds and meshes that other scanners made, as points in millimetres: the formats that
+`session.formats` reads, and the meshes that `session.nominal` reads.
 """
 
-import io
 import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.vectors import diagonal, finite_rows, lengths
-from slviewer.registration.open3d_loader import open3d
 from slviewer.session.nominal import FORMATS as MESHES
 from slviewer.session.nominal import MAX_COORDINATE_MM, MM, Units, read_nominal
 from slviewer.session.ply import COLOURS, NORMAL, PLACE
 from slviewer.session.reading import MAX_CLOUD_BYTES, expand_user, read_input
 from slviewer.session.results import digest_bytes
+from slviewer.session.shape_files import own_formats
 from slviewer.surface.shapes import Mesh, vertex_normals
 
-TEXTS = (".xyz", ".txt", ".asc", ".pts", ".csv")
-FORMATS = (".ply", ".pcd", ".e57", *TEXTS, *(each for each in MESHES if each != ".ply"))
+_READ = {each: form for form in own_formats().values() if form.read for each in form.suffixes}
+FORMATS = (*_READ, *(each for each in MESHES if each not in _READ))
 LEAST_POINTS = 100
 SMALLEST_MM, LARGEST_MM = 2.0, 10_000.0
 """Diagonals outside of which the unit may be another."""
 LONGEST_EDGE = 0.02
 """Of a mesh's diagonal: longer edges are divided, or a flat face would have its corners alone."""
 _SIGMAS = ("sigma", "sigma_noise")
-_PCD_NAMES = dict(zip(("normal_x", "normal_y", "normal_z"), NORMAL, strict=True))
-_PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +65,9 @@ def read_cloud(path: Path | str, unit: Units | None = None) -> tuple[str, list[R
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            if suffix == ".e57":
-                columns = _read_e57(path)
-            else:
-                read = {".ply": _read_ply, ".pcd": _read_pcd}.get(suffix, _read_text)
-                columns = [read(path, data)]
+            chosen = _READ[suffix]
+            assert chosen.read is not None
+            columns = chosen.read(path, data)
     except InputError:
         raise
     except Exception as error:  # a file from anywhere may make its reader fail in any way
@@ -82,8 +75,8 @@ def read_cloud(path: Path | str, unit: Units | None = None) -> tuple[str, list[R
             f"{path.name} cannot be read ({type(error).__name__}: {error}): it is damaged or"
             " truncated; export the cloud again"
         ) from error
-    chosen = unit or ("m" if suffix == ".e57" else "mm")
-    return digest_bytes(data).hex(), [_check_points(path.name, each, chosen) for each in columns]
+    units = unit or chosen.unit
+    return digest_bytes(data).hex(), [_check_points(path.name, each, units) for each in columns]
 
 
 def unit_warning(name: str, points: np.ndarray, unit: Units) -> str:
@@ -169,110 +162,3 @@ def _read_mesh(path: Path, unit: Units | None) -> ReadCloud:
     normals = vertex_normals(mesh).astype(np.float64)
     points = mesh.vertices.astype(np.float64)
     return ReadCloud(points, nominal.units or "mm", normals, notes=tuple(notes))
-
-
-def _read_ply(path: Path, data: bytes) -> dict[str, np.ndarray]:
-    """Return the properties of a PLY's vertices by name."""
-    import trimesh
-
-    loaded: Any = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
-    vertices = loaded.metadata["_ply_raw"]["vertex"]
-    values = vertices["data"]
-    names = values if isinstance(values, dict) else values.dtype.names
-    return {name: np.ravel(values[name])[: vertices["length"]] for name in names}
-
-
-def _read_pcd(path: Path, data: bytes) -> dict[str, np.ndarray]:
-    """Return the fields of a PCD by name, and its sensor's place."""
-    match = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
-    if match is None:
-        raise ValueError("it has no line DATA")
-    rows = map(str.split, data[: match.start()].decode("ascii", "replace").splitlines())
-    header = {words[0].upper(): words[1:] for words in rows if words}
-    count, form, body = int(header["POINTS"][0]), match[1].lower(), data[match.end() :]
-    names, repeats = header["FIELDS"], header.get("COUNT", ["1"] * len(header["FIELDS"]))
-    fields = [
-        (f"{name}{'_' * i if name == '_' else ''}", f"<{_PCD_TYPES[kind]}{size}", int(times))
-        for i, (name, kind, size, times) in enumerate(
-            zip(names, header["TYPE"], header["SIZE"], repeats, strict=True), 1
-        )
-    ]
-    if form == b"binary_compressed":
-        if len(body) < 8 + int.from_bytes(body[:4], "little"):
-            raise ValueError("it breaks off")
-        cloud = open3d().io.read_point_cloud(str(path))
-        columns = dict(zip(PLACE, np.asarray(cloud.points).T, strict=True))
-        columns |= dict(zip(NORMAL, np.asarray(cloud.normals).T, strict=False))
-    elif form == b"binary":
-        values = np.frombuffer(body, np.dtype(fields), count)
-        columns = {_PCD_NAMES.get(name, name): values[name] for name in values.dtype.names or ()}
-    else:
-        columns, start = {}, 0
-        table = np.loadtxt(io.BytesIO(body), ndmin=2, max_rows=count)
-        for name, _, times in fields:
-            columns[_PCD_NAMES.get(name, name)] = table[:, start : start + times]
-            start += times
-    if len(columns["x"]) != count:
-        raise ValueError(f"it has {len(columns['x'])} of {count} points")
-    sensor = np.array(header.get("VIEWPOINT", [0, 0, 0])[:3], np.float64)
-    return columns | ({"sensor": sensor} if sensor.any() else {})
-
-
-def _read_text(path: Path, data: bytes) -> dict[str, np.ndarray]:
-    """Return the columns of a text: x y z first, then normals and colours where numbers are
-    such."""
-    lines = data.decode("utf-8-sig", "replace").splitlines()
-    first = next((i for i, line in enumerate(lines) if _is_row(line)), None)
-    if first is None:
-        raise InputError(
-            f"{path.name} has no line of three numbers: write x y z of a point a line, with decimal"
-            " points"
-        )
-    separator = next((each for each in ";," if each in lines[first]), None)
-    rows = np.loadtxt(lines[first:], delimiter=separator, comments=("#", "//"), ndmin=2)
-    columns, k = dict(zip(PLACE, rows.T[:3], strict=True)), 3
-    while k + 3 <= rows.shape[1]:
-        triple = rows[:, k : k + 3]
-        names: tuple[str, ...] = ()
-        some = triple[finite_rows(triple)]
-        if len(some) and np.percentile(np.abs(lengths(some) - 1), 99) < 0.01:
-            names = NORMAL
-        elif len(some) and (some == np.rint(some)).all() and 0 <= some.min() < 2 < some.max() < 256:
-            names, triple = COLOURS, np.nan_to_num(triple).astype(np.uint8)
-        columns |= dict(zip(names, triple.T, strict=False))
-        k += len(names) or 1
-    return columns
-
-
-def _is_row(line: str) -> bool:
-    """Whether a line holds three numbers or more, with decimal points."""
-    words = re.split(r"[;\s]\s*" if ";" in line or "," not in line else r",\s*", line.strip())
-    try:
-        return len([float(word) for word in words if word]) >= 3
-    except ValueError:
-        return False
-
-
-def _read_e57(path: Path) -> list[dict[str, np.ndarray]]:
-    """Return the columns of each scan of an E57 in one frame, and its scanner's place."""
-    if find_spec("pye57") is None:
-        raise InputError(
-            f"{path.name}: .e57 files need the package pye57: install it with pip install"
-            " 'slviewer[e57]'"
-        )
-    import pye57
-
-    file, scans = pye57.E57(str(path)), []
-    try:
-        for i in range(file.scan_count):
-            header = file.get_header(i)
-            values = file.read_scan(i, colors=True, ignore_missing_fields=True)
-            names = [(f"cartesian{each.upper()}", each) for each in PLACE]
-            names += [(f"color{each.title()}", each) for each in COLOURS]
-            columns = {ours: values[theirs] for theirs, ours in names if theirs in values}
-            scans.append(columns | ({"sensor": header.translation} if header.has_pose() else {}))
-    finally:
-        file.close()
-    if not scans:
-        raise InputError(f"{path.name} holds no scans: export the cloud again")
-    return scans

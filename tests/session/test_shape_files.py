@@ -12,11 +12,13 @@ from facts import raises
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.registration.open3d_loader import open3d
-from slviewer.session import cad, mesh_files
-from slviewer.session.mesh_files import (
-    MESH_FORMATS,
-    POINT_FORMATS,
+from slviewer.session import cad
+from slviewer.session.formats import e57
+from slviewer.session.importers.clouds import read_cloud
+from slviewer.session.shape_files import (
     estimated_bytes,
+    mesh_formats,
+    own_formats,
     read_mesh_file,
     write_shape,
 )
@@ -50,7 +52,7 @@ def near(found: np.ndarray, truth: np.ndarray, within: float = 1e-6) -> None:
     np.testing.assert_allclose(found, truth, rtol=within, atol=within)
 
 
-@pytest.mark.parametrize("suffix", MESH_FORMATS[:4])
+@pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "glb"])
 def test_trimesh_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"part.{suffix}"
     assert write_shape(path, MESH, notes=NOTES) == path.stat().st_size
@@ -118,13 +120,13 @@ def test_a_missing_package_is_named_with_its_remedy(
     def find(name: str) -> object:
         return None if name == package else find_spec(name)
 
-    monkeypatch.setattr(mesh_files, "find_spec", find)
+    monkeypatch.setattr(e57, "find_spec", find)
     monkeypatch.setattr(cad, "find_spec", find)
     with raises(SlviewerError, package, f".{suffix}", "pip install 'slviewer["):
         write_shape(tmp_path / f"part.{suffix}", MESH if suffix == "3mf" else POINTS)
 
 
-@pytest.mark.parametrize("suffix", MESH_FORMATS[:4])
+@pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "glb"])
 def test_open3d_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"part.{suffix}"
     write_shape(path, MESH, notes=NOTES)
@@ -143,7 +145,7 @@ def test_open3d_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
         )  # type: ignore[index]
 
 
-@pytest.mark.parametrize("suffix", POINT_FORMATS[:3])
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz", "glb"])
 def test_clouds_are_read_by_both(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"cloud.{suffix}"
     write_shape(path, POINTS, scalars={"sigma_noise": POINTS.sigma_mm}, notes=NOTES)  # type: ignore[dict-item]
@@ -156,9 +158,10 @@ def test_clouds_are_read_by_both(tmp_path: Path, suffix: str) -> None:
         return
     cloud = open3d().io.read_point_cloud(str(path))
     near(np.asarray(cloud.points), POINTS.points)
-    if suffix == "ply":
+    if suffix in ("ply", "pcd"):
         assert np.array_equal(np.round(np.asarray(cloud.colors) * 255), POINTS.colours)
         near(np.asarray(cloud.normals), POINTS.normals)  # type: ignore[arg-type]
+    if suffix == "ply":
         raw = trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
         near(raw["sigma"].ravel(), POINTS.sigma_mm)  # type: ignore[arg-type]
         near(raw["sigma_noise"].ravel(), POINTS.sigma_mm)  # type: ignore[arg-type]
@@ -178,19 +181,19 @@ def test_text_is_read_by_whoever_reads_numbers(tmp_path: Path) -> None:
     near(trimesh.load(path).vertices, POINTS.points)
 
 
-@pytest.mark.parametrize("suffix", [each for each in MESH_FORMATS if each != "3mf"])
+@pytest.mark.parametrize("suffix", [each for each in mesh_formats() if each != "3mf"])
 def test_units_are_stated_and_sizes_foreseen(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"part.{suffix}"
     size = write_shape(path, MESH, notes=NOTES)
-    head = path.read_bytes()[:1500] if suffix != "xyz" else b"slviewer: units mm; splined"
+    head = path.read_bytes()[:1500]
     assert b"slviewer" in head and (b"metres" if suffix == "glb" else b"units mm") in head
     assert (suffix == "stl") != (b"splined" in head) and not head.startswith(b"solid")
     foreseen = estimated_bytes(suffix, len(MESH.vertices), len(MESH.faces), scalars=1)
-    assert foreseen == pytest.approx(size, rel=0.2 if suffix in ("obj", "xyz") else 0.03)
+    assert foreseen == pytest.approx(size, rel=0.2 if suffix == "obj" else 0.03)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("suffix", MESH_FORMATS)
+@pytest.mark.parametrize("suffix", mesh_formats())
 def test_nothing_unknown_is_nan(tmp_path: Path, suffix: str) -> None:
     assert MESH.normals is not None and MESH.sigma_mm is not None
     normals, sigma = MESH.normals.copy(), MESH.sigma_mm.copy()
@@ -198,10 +201,24 @@ def test_nothing_unknown_is_nan(tmp_path: Path, suffix: str) -> None:
     holed = Mesh(MESH.vertices, MESH.faces, normals, None, sigma)
     write_shape(tmp_path / f"whole.{suffix}", holed)
     whole = (tmp_path / f"whole.{suffix}").read_bytes()
-    if suffix in ("obj", "xyz"):
+    if suffix == "obj":
         assert b"nan" not in whole
-    found = trimesh.load(tmp_path / f"whole.{suffix}", process=False) if suffix != "xyz" else None
-    assert found is None or np.isfinite(found.bounds).all()
+    found = trimesh.load(tmp_path / f"whole.{suffix}", process=False)
+    assert np.isfinite(found.bounds).all()
+
+
+@pytest.mark.parametrize(
+    "suffix", [name for name, form in own_formats().items() if form.takes_points and form.read]
+)
+def test_what_is_written_is_read_again(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cloud.{suffix}"
+    write_shape(path, POINTS, scalars={"sigma_noise": POINTS.sigma_mm}, notes=NOTES)  # type: ignore[dict-item]
+    _, (cloud,) = read_cloud(path)
+    near(cloud.points, POINTS.points)
+    assert np.array_equal(cloud.colours, POINTS.colours)  # type: ignore[arg-type]
+    if suffix in ("ply", "pcd"):
+        near(cloud.normals, POINTS.normals)  # type: ignore[arg-type]
+        near(cloud.sigma_mm, POINTS.sigma_mm)  # type: ignore[arg-type]
 
 
 def test_numbers_as_text(tmp_path: Path) -> None:
@@ -215,7 +232,7 @@ def test_numbers_as_text(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
-    with raises(InputError, "a.doc", ".ply", ".stl", ".obj", ".glb", ".3mf", ".xyz"):
+    with raises(InputError, "a.doc", ".ply", ".stl", ".obj", ".glb", ".3mf"):
         write_shape(tmp_path / "a.doc", MESH)
     with raises(InputError, "a.stl", ".ply", ".xyz", ".glb"):
         write_shape(tmp_path / "a.stl", POINTS)
