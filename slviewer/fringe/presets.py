@@ -3,10 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import ceil, log2
+from typing import Literal, get_args
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, Size
 
+PresetName = Literal["p18", "gray", "complementary", "multifrequency", "micro"]
+"""Each is a function of that name."""
 AXES: tuple[Axis, ...] = ("x", "y")
 MICRO_PX = (12.0, 16.0)
 """Shortest period of micro phase shifting, and about the longest."""
@@ -107,11 +110,7 @@ def short(projector: Size, axis: Axis) -> PatternSequence:
 
 
 PRESETS: dict[str, Callable[[Size], PatternSequence]] = {
-    "p18": p18,
-    "gray": gray,
-    "complementary": complementary,
-    "multifrequency": multifrequency,
-    "micro": micro,
+    name: globals()[name] for name in get_args(PresetName)
 }
 
 

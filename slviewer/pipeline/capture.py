@@ -26,7 +26,7 @@ from slviewer.devices.protocols import (
     stated_full_scale,
 )
 from slviewer.errors import Cancelled, InputError, SessionError, SlviewerError, UsageError
-from slviewer.fringe.presets import find_preset
+from slviewer.fringe.presets import PresetName, find_preset
 from slviewer.fringe.sequence import Axis, PatternSequence, one_axis
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_frames
@@ -81,8 +81,8 @@ class RigSettings(Callbacks):
     """How a rig captures.
 
     Args:
-        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light
-            themselves); by default the session's, else complementary.
+        patterns: Which sequence is projected, such as micro for surfaces that light themselves; by
+            default the session's, else complementary.
         exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
         exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the
             longest that does not clip it.
@@ -91,7 +91,7 @@ class RigSettings(Callbacks):
     ``set_up`` makes the devices of a choice of rig.
     """
 
-    patterns: str | None = None
+    patterns: PresetName | None = None
     exposure_ms: float | None = None
     exposures_ms: Sequence[float] = ()
     gain: float | None = None

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from slviewer.fringe.presets import find_preset
+from slviewer.fringe.presets import PresetName, find_preset
 from slviewer.fringe.sequence import parse_size
 from slviewer.session.exporters import write_pattern_folder
 from slviewer.target.board import Board
@@ -10,11 +10,11 @@ from slviewer.target.coded import draw_marker_sheet
 from slviewer.target.sheet import write_drawing, write_sheet
 
 
-def patterns(preset: str, projector: str, out: Path | str) -> str:
+def patterns(preset: PresetName, projector: str, out: Path | str) -> str:
     """Write the images of a pattern sequence, and the TOML that `import frames` reads.
 
     Args:
-        preset: p18, complementary, gray, multifrequency or micro.
+        preset: Which sequence.
         projector: Width x height of the projector, px.
         out: Folder to make.
 
