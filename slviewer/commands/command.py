@@ -17,7 +17,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import GenericAlias, MappingProxyType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import tyro
 
@@ -367,8 +367,10 @@ def _read_settings(module: _Module, name: str) -> Described:
 
 def _terminal_type(kind: Any) -> Any:
     """Return the type for the terminal: `str | Path` becomes the first of both, sequences become
-    tuples."""
+    tuples, and names or None are listed in their order."""
     choices = get_args(kind)
+    if len(choices) == 2 and choices[1] is type(None) and get_origin(choices[0]) is Literal:
+        return Literal[(None, *get_args(choices[0]))]
     if Path in choices and str in choices:
         first = next(choice for choice in choices if choice in (Path, str))
         return first | None if type(None) in choices else first
