@@ -79,9 +79,11 @@ def occupied_cubes(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndar
     """
     cube = np.floor(points / side).astype(np.int64)
     middle = np.median(cube[:: max(1, len(cube) // 1000)], axis=0).astype(np.int64)
-    cube = np.clip(cube - middle + (1 << _BITS - 1), 0, (1 << _BITS) - 1)
+    cube -= middle - (1 << _BITS - 1)
+    cube.clip(0, (1 << _BITS) - 1, out=cube)
     shifts = np.array([2 * _BITS, _BITS, 0])
-    keys, which = np.unique((cube << shifts).sum(axis=1), return_inverse=True)
+    packed = cube[:, 0] << shifts[0] | cube[:, 1] << shifts[1] | cube[:, 2]
+    keys, which = np.unique(packed, return_inverse=True)
     return keys[:, None] >> shifts & (1 << _BITS) - 1, which
 
 

@@ -380,8 +380,9 @@ def _measure_area(
     as in `deviation`, in its frame."""
     places, facing = surface.sample(COVERAGE_SAMPLES, seed=1)
     matched = np.isfinite(found.signed) & ~found.is_unmatched
-    feet = scan.points[matched] - found.signed[matched, None] * scan.towards[matched]
-    gap, _ = cKDTree(subsample(feet, MAX_FEET)).query(places, workers=-1)
+    some = subsample(np.flatnonzero(matched), MAX_FEET)
+    feet = scan.points[some] - found.signed[some, None] * scan.towards[some]
+    gap, _ = cKDTree(feet).query(places, workers=-1)
     is_visible = np.full(len(places), not views)
     for centres in views:
         is_visible |= np.all(
@@ -397,7 +398,7 @@ def _measure_area(
     far = np.flatnonzero(found.is_unmatched)
     if len(far) and len(open_places):
         near, which = cKDTree(scan.points[far]).query(places[open_places], workers=-1)
-        part = cKDTree(subsample(scan.points[matched], MAX_FEET))
+        part = cKDTree(scan.points[some])
         deviates = near <= part.query(places[open_places], workers=-1)[0]
         chosen, which = open_places[deviates], far[which[deviates]]
         value = _across_gap(scan, which, places[chosen], facing[chosen], surface)

@@ -64,6 +64,8 @@ a part with an error has no better one; more where hardly half of them fit."""
 LEAST_SCORE = 0.1
 """Share of the scan that must lie on the nominal after the coarse search: from there on a pose is
 fitted. The part itself reaches 0.5 and more, other parts below 0.15."""
+NOISE_COST = 1.2
+"""Of a pose that noise explains, over the noise's own cost."""
 MAX_ITERATIONS, FEW_ITERATIONS = 40, 10
 VIEWS = [
     unit_vectors(np.array(view))
@@ -265,7 +267,10 @@ def _improve_pose(
 ) -> NominalPose:
     """Return the pose of least cost among those turned by right angles about the model's main axes,
     as a plate fits in four ways but for its small features; and where no pose is good, by a few
-    degrees from there."""
+    degrees from there; the pose itself where noise alone is left."""
+    reach = REACH * surface.diagonal
+    if pose.is_exact and pose.is_good and pose.cost <= NOISE_COST * ((sigma_mm or 0) / reach) ** 2:
+        return pose
     for _ in range(TURN_ROUNDS):
         starts = _list_turned(points, normals, surface, pose)
         other = _choose_pose(points, normals, surface, sigma_mm, starts, pose) or pose

@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
+from slviewer.geometry.vectors import subsample
 from slviewer.inspection.deviation import (
     Deviation,
     colour_limit,
@@ -17,7 +18,7 @@ from slviewer.inspection.deviation import (
 )
 from slviewer.inspection.exclusion import NOISE
 from slviewer.inspection.tolerance import judge_deviation
-from slviewer.inspection.wrong_part import explain_misfit
+from slviewer.inspection.wrong_part import SAMPLES, explain_misfit
 from slviewer.pipeline.measure import (
     LoadSurface,
     MeasuredSurface,
@@ -191,10 +192,10 @@ def _explain_misfit(
     surface: MeasuredSurface, nominal: Nominal, result: Deviation, verdict: ToleranceVerdict
 ) -> str:
     """Return what other part the scan shows, in words; empty where it is the nominal one."""
-    measured = surface.measured
+    some = subsample(np.flatnonzero(surface.measured)[result.counted], SAMPLES)
     return explain_misfit(
-        surface.points[measured].astype(np.float64)[result.counted],
-        None if surface.normals is None else surface.normals[measured][result.counted],
+        surface.points.reshape(-1, 3)[some].astype(np.float64),
+        None if surface.normals is None else surface.normals.reshape(-1, 3)[some],
         nominal.mesh,
         result.T_nominal_scan,
         max(verdict.tolerance_mm, NOISE * result.noise_mm),
