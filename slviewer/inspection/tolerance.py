@@ -318,13 +318,12 @@ def _join_small(
             kept = own[np.argsort(np.abs(points.value[own]))[1:-1]]
             sigma = np.hypot(rms(noise[own]) / np.sqrt(len(own)), points.common[own].mean())
             value = float(points.value[kept].mean()) - sign * float(chosen_by[own].mean())
-            certain = abs(value) - FAIL_SIGMAS[1] * sigma
+            certain = sign * value - FAIL_SIGMAS[1] * sigma
             if certain > tolerance:
                 bound[own] = certain
-                varies = np.full(len(own), max(0.0, points.value[kept].std()))
-                joined = _Means(
-                    np.full(len(own), value), np.full(len(own), sigma), means.radius[own], varies
-                )
+                every = np.ones(len(own))
+                spread = every * points.value[kept].std()
+                joined = _Means(value * every, sigma * every, means.radius[own], spread)
                 means = _replace(means, own, joined)
     return means, bound
 
