@@ -313,13 +313,14 @@ def _join_small(
         large = np.flatnonzero(sign * points.value > limit)
         for members in label_clusters(points.place[large], link):
             own = large[members]
-            if len(own) < LEAST_POINTS or np.sum(bound[own] > tolerance) >= MIN_PLACE:
-                continue
+            if len(own) < LEAST_POINTS or np.mean(bound[own] > tolerance) > 0.5:
+                continue  # means hold it
             kept = own[np.argsort(np.abs(points.value[own]))[1:-1]]
             sigma = np.hypot(rms(noise[own]) / np.sqrt(len(own)), points.common[own].mean())
             value = float(points.value[kept].mean()) - sign * float(chosen_by[own].mean())
             certain = sign * value - FAIL_SIGMAS[1] * sigma
             if certain > tolerance:
+                own = own[bound[own] <= tolerance]  # which join the others, if there are any
                 bound[own] = certain
                 every = np.ones(len(own))
                 spread = every * points.value[kept].std()

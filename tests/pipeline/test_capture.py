@@ -133,7 +133,7 @@ def test_patterns_names_and_force(run: Run, tmp_path: Path):
     ("arguments", "status", "facts"),
     [
         (("--rig", "nothing"), 1, ["'nothing'", "simulated"]),
-        (("--rig", "simulated", "--patterns", "zigzag"), 1, ["'zigzag'", "complementary", "p18"]),
+        (("--rig", "simulated", "--patterns", "zigzag"), 2, ["'zigzag'", "complementary", "p18"]),
         (("--rig", "simulated", "--exposures-ms", "4", "4"), 1, ["4", "once"]),
         (
             ("--rig", "simulated", "--exposures-ms", "4", "8", "--exposure-ms", "2"),
