@@ -517,12 +517,15 @@ class StepPanel(ControlGroup):
         return self.snapshot.step(self.key).state == "ready"
 
     def add_plugin(self, plugin: type["PanelPlugin"]) -> None:
-        """Add a panel of another package at the end; one that cannot be built is reported."""
+        """Add a panel of another package at the end. Raises what building it raises; it is not
+        drawn then."""
+        before = list(self.parts)
         try:
             with self._container, self._gui.add_folder(plugin.title, expand_by_default=False):
                 plugin(self)
-        except Exception as error:  # whatever a package's panel raises must not stop the program
-            self.context.report_failure(error)
+        except Exception:
+            self.parts = before
+            raise
 
     def show_points(self, name: str, points: np.ndarray | None) -> None:
         """Move the browsers' views to what is shown now, points (..., 3) mm, or once the panel is
@@ -551,9 +554,16 @@ class StepPanel(ControlGroup):
         self.redraw()
 
     def redraw(self) -> None:
-        """Draw the parts, then the panel."""
+        """Draw the parts, then the panel; a part of another package that fails is reported, and
+        not drawn again."""
         for each in (*self.parts, self):
-            each.draw()
+            try:
+                each.draw()
+            except Exception as error:
+                if not isinstance(each, PanelPlugin):
+                    raise
+                self.parts.remove(each)
+                self.context.report_failure(error)
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the latest frame; called while the panel is shown, at most ten times a second."""
@@ -591,7 +601,11 @@ class PanelPlugin(PanelPart):
     title: ClassVar[str]
 
 
-PANEL_PLUGINS = PluginGroup[type]("slviewer.panels", type, lambda: ())
+PANEL_PLUGINS = PluginGroup[type[PanelPlugin]](
+    "slviewer.panels",
+    type,  # type: ignore[arg-type]
+    lambda: (),
+)
 
 
 class RestoreButton(PanelPart):

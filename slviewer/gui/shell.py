@@ -22,7 +22,6 @@ from slviewer.gui.panel import (
     PANEL_PLUGINS,
     ControlGroup,
     PanelContext,
-    PanelPlugin,
     StepPanel,
 )
 from slviewer.gui.scene import CAMERA, PROJECTOR, SceneLayer
@@ -226,8 +225,10 @@ class Shell(ControlGroup):
                 module = importlib.import_module(f"slviewer.gui.steps.{key}")
                 self._panels[key] = getattr(module, f"{key.title()}Panel")(self.context)
             for plugin in PANEL_PLUGINS.usable().values():
-                added: type[PanelPlugin] = plugin
-                self._panels[added.step].add_plugin(added)
+                try:
+                    self._panels[plugin.step].add_plugin(plugin)
+                except Exception as error:  # whatever a package's panel raises
+                    self.context.report_failure(error)
         with panel.add_tab("Session"):
             self._session = Text(gui)
             links = gui.add_button(

@@ -381,6 +381,8 @@ class Operation(Generic[P, S, R]):
             return_annotation=Findings[R],
         )
         self.__doc__ = describe(function, settings)
+        if name in OPERATIONS:
+            raise ValueError(f"an operation is called {name} already")
         OPERATIONS[name] = self
 
     def __call__(self, session: SessionLike, *args: P.args, **kwargs: P.kwargs) -> Findings[R]:

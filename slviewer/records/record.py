@@ -437,6 +437,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        if cls.kind in RECORDS:
+            raise ValueError(f"a kind of records is called {cls.kind} already")
         RECORDS[cls.kind] = cls
 
     @classmethod

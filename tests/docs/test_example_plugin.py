@@ -116,14 +116,19 @@ def test_a_broken_plugin_is_reported_and_stops_nothing(
     entries = (
         "[slviewer.drivers]\nlost = broken_module:DRIVER\nopencv = json:dumps\n"
         "[slviewer.importers]\nwrong = json:dumps\n[slviewer.boards]\nhexgrid = json:nothing\n"
+        "[slviewer.operations]\nmerge = other_merge:merge\n"
     )
     install("broken", "1.0", entries)
     (tmp_path / "site" / "broken_module.py").write_text(
         "raise RuntimeError('the maker forgot a file')\n"
     )
+    (tmp_path / "site" / "other_merge.py").write_text(
+        "from slviewer.plugins import Record, operation\n"
+        "class Own(Record, frozen=True, kw_only=True):\n    kind = 'merge'\n    title = 'x'\n"
+    )
     status, printed, error = run("plugins")
     printed += error
-    assert status == 1
+    assert status == 1 and "a kind of records is called merge already" in printed
     assert "the maker forgot a file" in printed and "the name opencv is taken" in printed
     assert "not a FolderLayout" in printed and "broken 1.0" in printed
     status, printed, _ = run("devices")

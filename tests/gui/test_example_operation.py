@@ -95,3 +95,21 @@ def test_its_panel_measures_and_the_page_shows_the_figure(session: Path, browser
         expect(page.get_by_text(f"{found.mean_percent:.1f}", exact=True)).to_be_visible()
         page.context.close()
         wizard.close()
+
+
+@pytest.mark.parametrize("broken", ["step", "build", "draw"])
+def test_a_broken_panel_stops_nothing(
+    session: Path, browser: Browser, monkeypatch: pytest.MonkeyPatch, broken: str
+) -> None:
+    def fail(panel: object) -> None:
+        raise RuntimeError("the maker forgot a file")
+
+    panel = import_module("slviewer_example.brightness_panel").BrightnessPanel
+    monkeypatch.setattr(panel, broken, "nowhere" if broken == "step" else fail)
+    with Operator(session, timing=CALM) as operator:
+        wizard, page = App(operator, Serving(port=0)), new_page(browser)
+        page.goto(wizard.server.link())
+        click(page, "6. Scan")
+        expect(page.get_by_text("Calibrate first.")).to_be_visible()
+        page.context.close()
+        wizard.close()
