@@ -257,8 +257,9 @@ def _list_places(
     )
     bound, certain = means.bound(), np.abs(single.value) - SINGLE_SIGMAS * single.sigma
     large = np.flatnonzero((certain > bound) & (certain > tolerance))
+    tree = cKDTree(points.place)
     if len(large) and len(points) >= BESIDE:
-        near = cKDTree(points.place).query(points.place[large], k=BESIDE)[1]
+        near = tree.query(points.place[large], k=BESIDE)[1]
         sided = np.sign(points.value[large])[:, None] * points.value[near]
         last = np.argsort(sided, axis=1)[:, -MIN_PLACE]  # one or two may be spikes
         beside = np.take_along_axis(near, last[:, None], axis=1)[:, 0]
@@ -274,7 +275,7 @@ def _list_places(
         is_better = wider.bound(times) > bound[suspect]
         bound[suspect[is_better]] = wider.bound(times)[is_better]
         means = _replace(means, suspect[is_better], wider.take(is_better))
-    means, bound = _join_small(points, means, bound, tolerance)
+    means, bound = _join_small(points, means, bound, tolerance, median_spacing(tree, 2000))
     area, link = deviation.area, max(deviation.area.spacing_mm, float(np.median(means.radius)))
     found = list[DeviatingPlace]()
     missing = np.flatnonzero(np.abs(np.nan_to_num(area.deviation)) > tolerance + area.spacing_mm)
@@ -297,7 +298,7 @@ def _list_places(
 
 
 def _join_small(
-    points: _Points, means: _Means, bound: Floats, tolerance: float
+    points: _Points, means: _Means, bound: Floats, tolerance: float, spacing: float
 ) -> tuple[_Means, Floats]:
     """Return the means, and what they exceed for certain, with connected points beyond the
     tolerance taken together where no mean holds them: what is thinner than a mean, as a rib.
@@ -306,7 +307,7 @@ def _join_small(
     tolerance would, the mean of a normal distribution cut off at `SUSPECT`.
     """
     noise, bound = points.noise, bound.copy()
-    link, limit = JOINED * median_spacing(cKDTree(points.place), 2000), SUSPECT * tolerance
+    link, limit = JOINED * spacing, SUSPECT * tolerance
     cut = (limit - tolerance) / noise
     chosen_by = noise * norm.pdf(cut) / norm.sf(cut)
     for sign in (-1, 1):
