@@ -81,8 +81,8 @@ class RigSettings(Callbacks):
     """How a rig captures.
 
     Args:
-        patterns: Which sequence is projected, such as micro for surfaces that light themselves; by
-            default the session's, else complementary.
+        patterns: Sequence to project, micro for surfaces that light themselves; by default the
+            session's, else complementary.
         exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
         exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the
             longest that does not clip it.

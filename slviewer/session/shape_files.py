@@ -22,7 +22,7 @@ from slviewer.session.atomic import replace_file
 from slviewer.session.formats.glb import encode_glb
 from slviewer.session.formats.obj import write_textured_obj
 from slviewer.session.ply import check_faces
-from slviewer.session.shape_format import Columns, Shape, ShapeFormat
+from slviewer.session.shape_format import Columns, Shape, ShapeFormat, split_shape
 from slviewer.surface.shapes import Mesh, PointSet
 
 
@@ -104,9 +104,7 @@ def write_shape(
     unchanged).
     """
     path = Path(path)
-    points, faces = (
-        (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
-    )
+    points, faces = split_shape(shape)
     chosen = _find_format(path, is_mesh=faces is not None)
     if not len(points) or (faces is not None and not len(faces)):
         raise InputError(f"{path.name} would be empty: there is nothing to write")

@@ -68,6 +68,13 @@ class ShapeFormat:
         return tuple(f".{each}" for each in (self.name, *self.others))
 
 
+def split_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the points (n, 3) mm of a shape, and the triangles (m, 3) of a mesh."""
+    if isinstance(shape, Mesh):
+        return shape.vertices, shape.faces
+    return shape.points, None
+
+
 def writing(encode: Callable[[Any, Sequence[str]], bytes]) -> Write:
     """Return what writes a file from ``encode(shape, notes)``, its content."""
 

@@ -11,8 +11,14 @@ import numpy as np
 
 from slviewer import __version__
 from slviewer.errors import InputError
-from slviewer.session.shape_format import Shape, ShapeFormat, Sizes, to_trimesh, writing
-from slviewer.surface.shapes import Mesh
+from slviewer.session.shape_format import (
+    Shape,
+    ShapeFormat,
+    Sizes,
+    split_shape,
+    to_trimesh,
+    writing,
+)
 
 _LIMIT = 2**32 - 1
 _SIZES = Sizes(1200, 24, 4, face=12)
@@ -24,8 +30,9 @@ def encode_glb(shape: Shape, notes: Sequence[str], texture: Any = None) -> bytes
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
-    points, faces = (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, ())
-    size = _SIZES.estimate(len(points), len(faces), colours=True, scalars=0)
+    points, faces = split_shape(shape)
+    count = 0 if faces is None else len(faces)
+    size = _SIZES.estimate(len(points), count, colours=True, scalars=0)
     if size > _LIMIT:
         raise InputError(
             f"{size / 1e9:.1f} GB do not fit into a .glb, which ends at 4.3: write a .ply instead"

@@ -9,14 +9,11 @@ from typing import Any
 import numpy as np
 
 from slviewer.session.ply import FACE, write_ply
-from slviewer.session.shape_format import Columns, Shape, ShapeFormat, Sizes
-from slviewer.surface.shapes import Mesh
+from slviewer.session.shape_format import Columns, Shape, ShapeFormat, Sizes, split_shape
 
 
 def _write(path: Path, shape: Shape, scalars: Columns, notes: Sequence[str]) -> None:
-    points, faces = (
-        (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
-    )
+    points, faces = split_shape(shape)
     write_ply(path, points, shape.colours, shape.normals, scalars, faces, notes)
 
 

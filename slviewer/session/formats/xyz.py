@@ -11,14 +11,13 @@ from slviewer.errors import InputError
 from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.session.atomic import arriving_file
 from slviewer.session.ply import COLOURS, NORMAL, PLACE
-from slviewer.session.shape_format import DECIMALS, Columns, Shape, ShapeFormat, Sizes
-from slviewer.surface.shapes import Mesh
+from slviewer.session.shape_format import DECIMALS, Columns, Shape, ShapeFormat, Sizes, split_shape
 
 _SIZES = Sizes(0, 33, 12)
 
 
 def _write(path: Path, shape: Shape, scalars: Columns, notes: Sequence[str]) -> None:
-    points = shape.vertices if isinstance(shape, Mesh) else shape.points
+    points, _ = split_shape(shape)
     columns = np.round(points.astype(np.float64), DECIMALS) + 0.0  # no "-0.000000"
     formats = [f"%.{DECIMALS}f"] * 3
     has_colours = shape.colours is not None
