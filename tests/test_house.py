@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = [
     "errors",
     "entry_points",
+    "inputs",
     "printable",
     "records",
     "geometry",

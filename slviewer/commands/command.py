@@ -22,7 +22,8 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import tyro
 
 from slviewer import terminal
-from slviewer.errors import SlviewerError, UsageError
+from slviewer.errors import SlviewerError
+from slviewer.inputs import Input, find_input
 
 ModelName = Literal["stereo", "pixelwise", "splined"]
 
@@ -35,31 +36,14 @@ Work = Callable[[], None]
 Command = Callable[..., Work]
 """Called with the arguments; what it returns does the work."""
 Run = Callable[[Function, Arguments], None]
-TYPES: dict[str, Any] = {"SessionLike": Path, "ModelName": ModelName, "Size": str}
+TYPES: dict[str, Any] = {
+    "SessionLike": Path,
+    "ModelName": ModelName,
+    "Size": str,
+    "Input": Input,
+}
 """What the terminal takes for types that are wider in Python; all others are looked up in the
 function's module."""
-
-
-LARGEST = 1e12
-"""The largest number, of any unit, that a command takes."""
-RANGES: dict[str, tuple[float, float]] = {
-    "at": (0, LARGEST),
-    "budget_s": (0, LARGEST),
-    "degree": (0, 10),
-    "exposure_ms": (1e-6, 1e6),
-    "exposures_ms": (1e-6, 1e6),
-    "fill_holes": (0, 1e5),
-    "folds": (2, 1000),
-    "gain": (0, 1e4),
-    "port": (0, 65535),
-    "poses": (0, 1000),
-    "seed": (0, (1 << 32) - 1),
-    "smooth": (0, 1000),
-    "temperature": (-100, 200),
-    "triangles": (1, 1e9),
-    "wait_s": (1, LARGEST),
-}
-"""Of the numbers that a command takes, by its parameter, where they are narrower."""
 JSON = ("commands.command:JsonFile",)
 PACKAGE = Path(__file__).parents[1]
 
@@ -99,16 +83,12 @@ def read_command(
     text, own = _read_function(module, name)
     parts = [own, *(_read_settings(*_find_module(each)) for each in options)]
     described = "\n".join(each for each, _ in parts)
-    shown = [
-        argument
-        for each, arguments in parts
-        for argument in arguments
-        if re.search(rf"^ {{4}}{argument[0].arg}:", each, re.MULTILINE)
-    ]
-    parameters = []
-    for argument, default, place in shown:
+    parameters, declared = [], dict[str, Input]()
+    for argument, default, place in _list_described(parts):
         assert argument.annotation is not None
-        kind = _terminal_type(place.evaluate(argument.annotation))
+        annotation = place.evaluate(argument.annotation)
+        declared[argument.arg] = find_input(annotation) or Input()
+        kind = _terminal_type(annotation)
         value = inspect.Parameter.empty if default is None else place.evaluate(default)
         if argument.arg in optional:
             kind, value = kind | None, None
@@ -125,9 +105,7 @@ def read_command(
 
         def work() -> None:
             """Check the numbers among the arguments, and run the function."""
-            _check_numbers(
-                {names.get(option, option): value for option, value in arguments.items()}
-            )
+            _check_numbers(arguments, declared, names)
             (run or show_result)(getattr(import_module(module.name), name), arguments)
 
         return work
@@ -210,18 +188,23 @@ def union(commands: Mapping[str, Function]) -> Any:
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
 
 
-def _check_numbers(arguments: Mapping[str, Any]) -> None:
-    """Raise UsageError for numbers outside of their range in `RANGES`, and for any that is infinite
-    or not a number."""
+def _list_described(parts: Sequence["Described"]) -> list["Argument"]:
+    """Return the arguments that are described: the others are for Python alone."""
+    return [
+        argument
+        for text, arguments in parts
+        for argument in arguments
+        if re.search(rf"^ {{4}}{argument[0].arg}:", text, re.MULTILINE)
+    ]
+
+
+def _check_numbers(
+    arguments: Arguments, declared: Mapping[str, Input], names: Mapping[str, str]
+) -> None:
+    """Raise UsageError for a number among the arguments that is not what was declared, under the
+    name of its option."""
     for name, value in arguments.items():
-        low, high = RANGES.get(name, (-LARGEST, LARGEST))
-        for number in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(number, float | int) and not low <= number <= high:
-                stated = f"{number:g}" if abs(number) < LARGEST else str(number)[:20]
-                raise UsageError(
-                    f"--{name.replace('_', '-')} is {stated}: give a number from {low:g} to"
-                    f" {high:g}"
-                )
+        declared[name].check(f"--{names.get(name, name).replace('_', '-')}", value)
 
 
 Argument = tuple[ast.arg, ast.expr | None, "_Module"]
@@ -366,8 +349,10 @@ def _read_settings(module: _Module, name: str) -> Described:
 
 
 def _terminal_type(kind: Any) -> Any:
-    """Return the type for the terminal: `str | Path` becomes the first of both, sequences become
-    tuples, and names or None are listed in their order."""
+    """Return the type for the terminal, without what `Input` declares: `str | Path` becomes the
+    first of both, sequences become tuples, and names or None are listed in their order."""
+    if find_input(kind):
+        kind = get_args(kind)[0]
     choices = get_args(kind)
     if len(choices) == 2 and choices[1] is type(None) and get_origin(choices[0]) is Literal:
         return Literal[(None, *get_args(choices[0]))]

@@ -28,6 +28,7 @@ from slviewer.commands.command import (
 )
 from slviewer.entry_points import IMPORTERS, list_names
 from slviewer.errors import DeviceError, InputError, UsageError
+from slviewer.inputs import Input
 
 if TYPE_CHECKING:
     from slviewer.devices.browser import PageChannels, PageRole
@@ -50,10 +51,10 @@ class PageOptions:
         wait_s: How long to wait until each page is opened and ready, in s.
     """
 
-    port: int = 8080
+    port: Annotated[int, Input(0, 65535)] = 8080
     host: str = "127.0.0.1"
     tls: bool = False
-    wait_s: float = PAGE_PATIENCE_S
+    wait_s: Annotated[float, Input(1)] = PAGE_PATIENCE_S
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,10 @@ from typing import Any, get_args
 
 import numpy as np
 
-from slviewer.gui.panel import PanelPart, StepPanel
+from slviewer.gui.panel import Form, PanelPart, StepPanel
 from slviewer.gui.widgets import Html, Picture, Text, coloured, paragraph
-from slviewer.pipeline.capture import FULL_TURN_DEG, STEPS
-from slviewer.pipeline.suggest_exposure import BUDGET_S, STATES, ExposureSuggestion
-from slviewer.registration.multiway import MOST_SCANS
+from slviewer.pipeline.capture import CaptureSettings, TurnSettings
+from slviewer.pipeline.suggest_exposure import STATES, ExposureSuggestion
 from slviewer.session.capture import Role
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel
 from slviewer.session.importers.layouts import Codec, layouts
@@ -44,7 +43,7 @@ class ExposureInputs(PanelPart):
 
     def build(self) -> None:
         """Create the inputs."""
-        self._budget = self.number("Time limit, s", BUDGET_S, 0.5, 600.0, 0.5, "Of one capture")
+        self._budget = Form(self, CaptureSettings, "budget_s")["budget_s"]
         self._budget.visible = False
         self._suggest = self.button(
             "Suggest exposure", self._request, "sun",
@@ -151,23 +150,13 @@ class TurnInputs(PanelPart):
         """Create the inputs."""
         operator = self._operator
         with self._gui.add_folder("Turntable") as self._folder:
-            self._steps = self.number("Steps", STEPS, 2, MOST_SCANS, 1, "Scans of a turn")
-            self._range = self.number(
-                "Range, °",
-                FULL_TURN_DEG,
-                -FULL_TURN_DEG,
-                FULL_TURN_DEG,
-                5.0,
-                "360 for a full turn; negative turns the other way",
-            )
+            self._turn = Form(self, TurnSettings, "steps", "range_deg")
             merge = self.checkbox(
                 "Merge and mesh", "At the end; the mesh is closed, also where the part stands", True
             )
             self._scan = self.button(
                 "Scan all round",
-                lambda: operator.scan_all_round(
-                    int(self._steps.value), float(self._range.value), then_merge=merge.value
-                ),
+                lambda: operator.scan_all_round(**self._turn.values(), then_merge=merge.value),
                 "rotate-360",
             )
             self._resume = self.button(

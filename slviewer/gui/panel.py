@@ -21,6 +21,7 @@ from slviewer.errors import InputError, SlviewerError, hide_passwords
 from slviewer.gui.hints import HINTS
 from slviewer.gui.scene import Colour, ViewerScene, Viewpoints
 from slviewer.gui.widgets import NOTICES, link, paragraph
+from slviewer.inputs import find_inputs, read_hint
 from slviewer.server.secure import SafeServer
 from slviewer.session.recent import RecentSessions
 from slviewer.session.store import Session
@@ -329,6 +330,37 @@ class Painter:
     def cancel(self, show: Callable[[Any], Any]) -> None:
         """Drop the request to `show` something; the next one is computed whatever its key."""
         self._requested.pop(show, None)
+
+
+class Form:
+    """Inputs of the fields of settings that declare what they may be; `values` are what was
+    entered. One that need not be given is 0 until then."""
+
+    def __init__(self, group: "ControlGroup", settings: type, *names: str) -> None:
+        self._inputs: dict[str, tuple[Any, type]] = {}
+        self._optional = set[str]()
+        for name, (each, declared) in find_inputs(settings).items():
+            if names and name not in names:
+                continue
+            value: Any = each.default
+            low, hint = declared.low, read_hint(settings, name)
+            if value is None:
+                low, value, hint = min(low, 0), 0.0, f"{hint} 0: not given."
+                self._optional.add(name)
+            title = declared.title(name)
+            handle = group.number(title, value, low, declared.high, declared.step, hint)
+            self._inputs[name] = handle, type(value)
+
+    def values(self) -> dict[str, Any]:
+        """What was entered, by the name of its field; None where nothing was given."""
+        return {
+            name: None if name in self._optional and not handle.value else kind(handle.value)
+            for name, (handle, kind) in self._inputs.items()
+        }
+
+    def __getitem__(self, name: str) -> Any:
+        """The handle of the input of that name."""
+        return self._inputs[name][0]
 
 
 class ControlGroup:

@@ -12,13 +12,14 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from slviewer import __version__
 from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
 from slviewer.evaluation.render import render
+from slviewer.inputs import RADIUS
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.operation import (
     Callbacks,
@@ -91,7 +92,7 @@ class BatchSettings(Callbacks):
     captures: Sequence[str] = ()
     model: ModelName | None = None
     shape: Shape | None = None
-    radius: float | None = None
+    radius: Annotated[float | None, RADIUS] = None
     accept_rejected: bool = False
     scheduler: str | None = None
 

@@ -10,6 +10,7 @@ without stretching.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -36,6 +37,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.geometry.shapes import fit_plane
 from slviewer.geometry.vectors import finite_rows, rms, rms_length
+from slviewer.inputs import RADIUS, Input
 from slviewer.pipeline.calibrate import CalibrateSettings
 from slviewer.pipeline.capture_phases import (
     capture_texture,
@@ -257,11 +259,7 @@ class CheckSettings:
 
     capture: str
     target: str = ""
-    radius: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.radius is not None and not self.radius > 0:
-            raise UsageError(f"a radius of {self.radius:g} mm is not possible: give a positive one")
+    radius: Annotated[float | None, RADIUS] = None
 
 
 @operation("check", Drift, CheckSettings, others=(TransformCheck,))
@@ -476,7 +474,7 @@ class ValidateSettings:
     """
 
     models: Sequence[ModelName] = ()
-    folds: int = FOLDS
+    folds: Annotated[int, Input(2, 1000)] = FOLDS
 
 
 @operation("validate", ModelComparison, ValidateSettings)

@@ -4,7 +4,7 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -35,6 +35,7 @@ from slviewer.fringe.decode import texture
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.lens import Lens
+from slviewer.inputs import Input
 from slviewer.pipeline.capture_phases import capture_texture, convert_to_8bit, decode_or_explain
 from slviewer.pipeline.models import (
     MODELS,
@@ -115,7 +116,7 @@ class CalibrateSettings:
     poses: Sequence[str] = ()
     exclude: Sequence[str] = ()
     smoothing: SmoothingKind = "spline"
-    degree: int = 5
+    degree: Annotated[int, Input(0, 10)] = 5
     cells_across: int | None = None
     replace_all: bool = False
     camera: Path | str | None = None

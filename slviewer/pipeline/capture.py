@@ -10,7 +10,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from slviewer.errors import Cancelled, InputError, SessionError, SlviewerError, 
 from slviewer.fringe.presets import PresetName, find_preset
 from slviewer.fringe.sequence import Axis, PatternSequence, one_axis
 from slviewer.geometry.rig import StereoRig
+from slviewer.inputs import EXPOSURE, GAIN, Input
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.examination import load_or_save_examination, warn_of_exposure
 from slviewer.pipeline.merge import MergeSettings, merge
@@ -92,9 +93,9 @@ class RigSettings(Callbacks):
     """
 
     patterns: PresetName | None = None
-    exposure_ms: float | None = None
-    exposures_ms: Sequence[float] = ()
-    gain: float | None = None
+    exposure_ms: Annotated[float | None, EXPOSURE] = None
+    exposures_ms: Annotated[Sequence[float], EXPOSURE] = ()
+    gain: Annotated[float | None, GAIN] = None
     set_up: SetUp = set_up
 
     def __post_init__(self) -> None:
@@ -133,7 +134,7 @@ class CaptureSettings(RigSettings):
             as possible.
         region: With --auto-exposure: x, y, width and height, px, of the part of the image that
             matters; by default all.
-        budget_s: With --auto-exposure: what the capture may last, s.
+        budget_s: What a capture may last, s, whose exposure is chosen for it.
         force: Replace a capture of that name (the old one goes to the session's trash).
 
     ``warn`` is called with what the camera could not be set to, and with frames that contradict the
@@ -149,7 +150,7 @@ class CaptureSettings(RigSettings):
     board: str | None = None
     auto_exposure: bool = False
     region: tuple[int, int, int, int] | None = None
-    budget_s: float = BUDGET_S
+    budget_s: Annotated[float, Input(0, 3600, "s", "Time limit", 0.5)] = BUDGET_S
     force: bool = False
     say: Callable[[str], None] = ignore_warnings
 
@@ -393,8 +394,8 @@ class TurnSettings(RigSettings):
     session: Path | str
     rig: RigLike
     _: KW_ONLY
-    steps: int = STEPS
-    range_deg: float = FULL_TURN_DEG
+    steps: Annotated[int, Input(2, MOST_SCANS)] = STEPS
+    range_deg: Annotated[float, Input(-360, 360, "°", "Range", 5.0)] = FULL_TURN_DEG
     name: str | None = None
     resume: bool = False
     merge: bool = True

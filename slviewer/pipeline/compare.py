@@ -4,12 +4,13 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.geometry.vectors import subsample
+from slviewer.inputs import Input
 from slviewer.inspection.deviation import (
     Deviation,
     colour_limit,
@@ -71,10 +72,10 @@ class CompareSettings:
     UNRECORDED: ClassVar = ("out", "load")
     scan: str
     nominal: Path | str
-    tolerance: float | None = None
-    min_area: float = LEAST_AREA
+    tolerance: Annotated[float | None, Input(0, 1000, "mm", "Tolerance ±", 0.01)] = None
+    min_area: Annotated[float, Input(0, 100, "%")] = LEAST_AREA
     units: Units | None = None
-    reach: float | None = None
+    reach: Annotated[float | None, Input(1e-6, 1e6, "mm")] = None
     out: Path | str | None = None
     model: ModelName | None = None
     accept_rejected: bool = False
@@ -82,8 +83,6 @@ class CompareSettings:
     load: LoadSurface | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.min_area <= 100:
-            raise UsageError(f"--min-area is {self.min_area:g}: give 0 to 100, in percent")
         if self.out is not None and Path(self.out).suffix.lower() != ".ply":
             raise UsageError(
                 f"coloured points are written as .ply, not as {Path(self.out).name}: end its"

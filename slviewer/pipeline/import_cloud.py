@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.vectors import box_middle, diagonal
+from slviewer.inputs import Input
 from slviewer.pipeline.operation import (
     Callbacks,
     Findings,
@@ -53,16 +54,12 @@ class ImportCloudSettings(Callbacks):
     files: Sequence[Path | str]
     _: KW_ONLY
     unit: Units | None = None
-    sigma_um: float | None = None
+    sigma_um: Annotated[float | None, Input(0.001, 1e6, "µm")] = None
     force: bool = False
 
     def __post_init__(self) -> None:
         if not self.files:
             raise UsageError("no file named: give one or more clouds to import")
-        if self.sigma_um is not None and not self.sigma_um > 0:
-            raise UsageError(
-                f"a sigma of {self.sigma_um:g} um is not possible: give a positive one"
-            )
 
 
 @takes_settings(ImportCloudSettings)

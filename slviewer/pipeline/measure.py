@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError, UsageError
 from slviewer.geometry.rigid import move_points
+from slviewer.inputs import Input
 from slviewer.inspection.features import KINDS, Feature, distance, relation
 from slviewer.inspection.fitting import NO_ERRORS, fit_feature
 from slviewer.inspection.regions import Region
@@ -263,7 +264,7 @@ class MeasureSettings:
     UNRECORDED: ClassVar = ("name", "load", "replaces")
     scan: str
     what: What
-    at: Sequence[int] = ()
+    at: Annotated[Sequence[int], Input(0)] = ()
     ball: Sequence[float] = ()
     box: Sequence[float] = ()
     name: str = ""

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
+from slviewer.inputs import check_inputs
 from slviewer.pipeline.cloud_corrections import scale_factor
 from slviewer.pipeline.imported_verdict import warning_of_imported
 from slviewer.records.calibration import ModelCalibration
@@ -419,6 +420,7 @@ class Operation(Generic[P, S, R]):
 
     def find(self, job: Job, settings: S) -> Iterator[Found[Any]]:
         """Yield everything that the operation finds, of any kind, once it is stored."""
+        check_inputs(settings)
         function = self.function(job.accepting(settings), settings)
         everything = cast("Generator[Found[Any], None, None]", function)
         with closing(everything):  # a file that it is about to place is given up where saving fails
@@ -495,7 +497,9 @@ def takes_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], V]], Cal
                 further = kwargs.keys() - signature.parameters.keys()
                 options = {name: kwargs.pop(name) for name in further}
                 kwargs.setdefault("options", options)
-            return function(settings(*args, **kwargs))
+            chosen = settings(*args, **kwargs)
+            check_inputs(chosen)
+            return function(chosen)
 
         call.__doc__ = describe(function, settings)
         returned = inspect.signature(function).return_annotation

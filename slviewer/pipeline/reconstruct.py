@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from slviewer.errors import DetectionError, InputError, UsageError
 from slviewer.evaluation.fit import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
+from slviewer.inputs import RADIUS
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.cloud_corrections import (
     resolve_region,
@@ -260,7 +261,7 @@ class VerifySettings:
     shape: Shape
     models: Sequence[ModelName] = ()
     depth_range: tuple[float, float] | None = None
-    radius: float | None = None
+    radius: Annotated[float | None, RADIUS] = None
     axis: Axis | None = None
     accept_rejected: bool = False
     check: bool = True
@@ -273,8 +274,6 @@ class VerifySettings:
         if self.depth_range is not None and not 0 < self.depth_range[0] < self.depth_range[1]:
             near, far = self.depth_range
             raise UsageError(f"the range {near:g} {far:g} is empty: give near and far in mm")
-        if self.radius is not None and not self.radius > 0:
-            raise UsageError(f"a radius of {self.radius:g} mm is not possible: give a positive one")
 
 
 @dataclass(frozen=True, eq=False)

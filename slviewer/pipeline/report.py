@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.errors import DamagedError, InputError, SlviewerError
 from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
+from slviewer.inputs import Input
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
 from slviewer.pipeline.cloud_corrections import describe_scale, restrict_cloud
 from slviewer.pipeline.measure import describe_measurement, section_lines
@@ -108,7 +109,7 @@ class ReportSettings(Callbacks):
     customer: str | None = None
     order: str | None = None
     operator: str | None = None
-    temperature: float | None = None
+    temperature: Annotated[float | None, Input(-100, 200, "°C")] = None
     logo: str | None = None
 
     def changed_details(self) -> dict[str, Any]:

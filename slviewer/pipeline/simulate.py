@@ -3,13 +3,14 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
+from slviewer.inputs import SEED, Input
 from slviewer.pipeline.capture_phases import compute_ahead
 from slviewer.pipeline.imported_verdict import SIMULATED_TRUTH
 from slviewer.pipeline.models import save_imported_stereo
@@ -42,8 +43,8 @@ def simulate(
     *,
     preset: Preset = "letter",
     scale: float = 1.0,
-    poses: int = 25,
-    seed: int = 0,
+    poses: Annotated[int, Input(0, 1000)] = 25,
+    seed: Annotated[int, SEED] = 0,
     progress: Progress = ignore_progress,
 ) -> list[str]:
     """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object

@@ -5,10 +5,12 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 from slviewer.devices.capture import can_burst
 from slviewer.devices.protocols import CameraSettings, Rig, report_driver_faults
 from slviewer.errors import DeviceError
+from slviewer.inputs import EXPOSURE, GAIN
 from slviewer.pipeline.capture import RigSettings, set_camera
 from slviewer.pipeline.examination import Check, CheckName, Preflight
 from slviewer.pipeline.operation import (
@@ -42,8 +44,8 @@ def check_rig(
     rig: RigLike,
     *,
     session: Path | str | None = None,
-    exposure_ms: float | None = None,
-    gain: float | None = None,
+    exposure_ms: Annotated[float | None, EXPOSURE] = None,
+    gain: Annotated[float | None, GAIN] = None,
     set_up: SetUp = set_up,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,

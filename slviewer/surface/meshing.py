@@ -3,13 +3,14 @@ what it did."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, TypeGuard
+from typing import Annotated, Any, Literal, TypeGuard
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.vectors import lengths, median_spacing
+from slviewer.inputs import Input, check_inputs
 from slviewer.reconstruction.cloud import Cloud, keep_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.reconstruction.reconstruct import triangulate_grid
@@ -66,20 +67,13 @@ class MeshingPlan:
     """
 
     method: Method | None = None
-    fill_holes_mm: float | None = None
-    triangles: int | None = None
-    smooth: int = 0
+    fill_holes_mm: Annotated[float | None, Input(0, 1e5, "mm", "Hole size", 0.1)] = None
+    triangles: Annotated[int | None, Input(4, 1e9, step=1000)] = None
+    smooth: Annotated[int, Input(0, 1000)] = 0
     watertight: bool = False
 
     def __post_init__(self) -> None:
-        if self.fill_holes_mm is not None and not self.fill_holes_mm >= 0:
-            raise InputError(
-                f"Holes of up to {self.fill_holes_mm} mm cannot be filled: give 0 or more."
-            )
-        if self.triangles is not None and self.triangles < 4:
-            raise InputError(f"{self.triangles} triangles make no mesh: ask for at least 4.")
-        if self.smooth < 0:
-            raise InputError(f"{self.smooth} rounds of smoothing were asked for: give 0 or more.")
+        check_inputs(self)
 
     def largest_hole_mm(self, method: Method, cell_mm: float) -> float:
         """Return how far across a hole may be to be filled."""

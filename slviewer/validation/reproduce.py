@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.fit import Comparison
+from slviewer.inputs import SEED
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
 from slviewer.pipeline.models import load_model, load_stereo
@@ -142,7 +143,7 @@ def reproduce(
     *,
     quick: bool = False,
     scale: float | None = None,
-    seed: int = 0,
+    seed: Annotated[int, SEED] = 0,
     say: Warn = ignore_warnings,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,

@@ -54,7 +54,7 @@ from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
 from slviewer.session.names import plain_name, safe_name
-from slviewer.session.nominal import NOMINALS, Units, read_nominal
+from slviewer.session.nominal import NOMINALS, read_nominal
 from slviewer.session.report_details import encode_logo
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard.change_requests import ChangeRequests
@@ -107,10 +107,9 @@ class ResultRequests(ChangeRequests):
         accept_rejected_calibration(self._store, on)
 
     @request("Verifying")
-    def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
-        """Compare the models on captures of a plane or a sphere; `radius_mm` helps to detect a
-        sphere."""
-        settings = VerifySettings(self._check_names(names), shape, radius=radius_mm, check=False)
+    def verify(self, names: Sequence[str], shape: Shape, **inputs: Any) -> None:
+        """Compare the models on captures of a plane or a sphere; `inputs`: further settings."""
+        settings = VerifySettings(self._check_names(names), shape, check=False, **inputs)
         self._run("Verifying", verify, settings, "scans")
 
     @request("Reconstructing")
@@ -373,18 +372,16 @@ class ResultRequests(ChangeRequests):
         self._run("Running the plan", run_plan, settings, "measurements")
 
     @request(COMPARING)
-    def compare_nominal(
-        self, on: str, nominal: str, units: Units | None = None, tolerance_mm: float | None = None
-    ) -> None:
-        """Measure a surface's deviation from one of the session's nominal models after best fit;
-        also writes a PLY."""
+    def compare_nominal(self, on: str, nominal: str, **inputs: Any) -> None:
+        """Measure a surface's deviation from one of the session's nominal models after best fit,
+        with further settings of `compare`; also writes a PLY."""
         path = self._store.folder / NOMINALS / safe_name(nominal)
         if not path.is_file():
             raise InputError(
                 f"there is no nominal model {nominal!r} in the session: upload it first"
             )
         load = partial(surface_to_measure, name=on)
-        settings = CompareSettings(on, path, tolerance_mm, units=units, load=load)
+        settings = CompareSettings(on, path, load=load, **inputs)
 
         def failed(error: BaseException) -> None:
             """Report why, in the words of the panel."""

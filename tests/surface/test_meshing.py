@@ -6,7 +6,7 @@ import trimesh
 from ball_scans import RADIUS, around, ball, off, rms
 from facts import missing_facts, raises
 
-from slviewer.errors import InputError, SlviewerError
+from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.edit import decimate, drop_small_parts, fill_holes, smooth
 from slviewer.surface.fuse import fuse
@@ -227,5 +227,5 @@ def test_refusals(points: PointSet) -> None:
     with raises(InputError, "NaN"):
         build_mesh(PointSet(np.full((300, 3), np.nan), np.zeros((300, 3))))
     for plan in ({"triangles": 2}, {"smooth": -1}, {"fill_holes_mm": float("nan")}):
-        with pytest.raises(InputError):
+        with raises(UsageError, "give a number from"):
             MeshingPlan(**plan)

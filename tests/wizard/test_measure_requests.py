@@ -218,7 +218,7 @@ def test_a_nominal_model_is_looked_at_kept_and_compared_with(
     assert operator.compare_nominal("object", "inch.stl")
     assert lacks(operator, "inch", "mm") == []
 
-    assert operator.compare_nominal("object", "My_ammonite.ply", tolerance_mm=1.5)
+    assert operator.compare_nominal("object", "My_ammonite.ply", tolerance=1.5)
     assert lacks(operator, "± 1.5 mm", "pass") == []
     session = now(operator)
     assert session.measurements[-1].record.what == "deviation"

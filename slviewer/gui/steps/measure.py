@@ -15,13 +15,14 @@ from slviewer.gui.colouring import (
     surface_values,
 )
 from slviewer.gui.measure_list import InspectionInputs, MeasurementList
-from slviewer.gui.panel import NO_SESSION, PanelPart, StepPanel, scan_options
+from slviewer.gui.panel import NO_SESSION, Form, PanelPart, StepPanel, scan_options
 from slviewer.gui.scene import Click, Drag
 from slviewer.gui.steps.scan import sort_scans
 from slviewer.gui.widgets import Html, Text, colour_bar, note, to_html
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
+from slviewer.pipeline.compare import CompareSettings
 from slviewer.pipeline.measure import MERGED, MeasuredSurface, Place, What
 from slviewer.pipeline.operation import Stored, load_arrays
 from slviewer.records.measurement import Measurement
@@ -291,9 +292,7 @@ class MeasurePanel(StepPanel):
                 self._units = self.choice(
                     "Units", "Of the nominal model; unknown: mm, if the sizes agree", units
                 )
-                self._tolerance = self.number(
-                    "Tolerance ±, mm", 0.0, 0.0, 1000.0, 0.01, "0: without a verdict"
-                )
+                self._inputs = Form(self, CompareSettings, "tolerance")
                 self._compare = self.button(
                     "Compare", self._request_comparison, "arrows-diff", None
                 )
@@ -499,7 +498,9 @@ class MeasurePanel(StepPanel):
 
     def _request_comparison(self) -> None:
         """Request the comparison with the chosen nominal model."""
-        tolerance = float(self._tolerance.value) or None
         self._operator.compare_nominal(
-            self._surface.name, self._nominal.value, self._units.value, tolerance
+            self._surface.name,
+            self._nominal.value,
+            units=self._units.value,
+            **self._inputs.values(),
         )

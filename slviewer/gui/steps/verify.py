@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.gui.capture_inputs import SimulatedObject
 from slviewer.gui.colouring import in_view, shade
-from slviewer.gui.panel import StepPanel, display_name, scan_options
+from slviewer.gui.panel import Form, StepPanel, display_name, scan_options
 from slviewer.gui.widgets import (
     PLOT_PX,
     Html,
@@ -19,6 +19,7 @@ from slviewer.gui.widgets import (
     records_html,
 )
 from slviewer.pipeline.operation import Stored, load_arrays
+from slviewer.pipeline.reconstruct import VerifySettings
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
@@ -76,13 +77,7 @@ class VerifyPanel(StepPanel):
             self._file = Text(gui)
         with gui.add_folder("Recorded captures") as self._recorded_folder:
             self._recorded = self.choice("Capture")
-            self._radius = self.number(
-                "Radius, mm",
-                0.0,
-                0.0,
-                2000.0,
-                hint="Approximate radius of a sphere, to detect it; 0: unknown",
-            )
+            self._inputs = Form(self, VerifySettings)
             for shape, icon in _ICONS.items():
                 self.button(f"Measure {shape}", partial(self._request, shape), icon)
             self._all = {
@@ -174,9 +169,8 @@ class VerifyPanel(StepPanel):
         """Request the verification of the chosen capture as a plane or sphere, or of every capture
         of the shape that has none yet."""
         names = self._waiting[shape] if every else [self._recorded.value]
-        radius = float(self._radius.value) if shape == "sphere" else 0.0
         if any(names):
-            self._operator.verify(names, shape, radius or None)
+            self._operator.verify(names, shape, **self._inputs.values())
 
 
 def shape_of(scan: ScanView) -> str:
