@@ -31,6 +31,8 @@ LEAST_POINTS, MOST_POINTS = 6, 64
 FAIL_SIGMAS = {1: 3.0, 2: 2.5, 4: 2.0, 8: 2.0}
 """Standard deviations by which a mean fails, by how many times as many points it averages: there
 are hundreds of the smallest."""
+DOUBT_SIGMAS = 1.0
+"""Standard deviations by which points that lie beside each other keep a part from passing."""
 SINGLE_SIGMAS = 4.0
 """Standard deviations by which single points fail, `MIN_PLACE` or more of `BESIDE` neighbours."""
 BESIDE = 8
@@ -114,7 +116,7 @@ def judge_deviation(
     count = float(np.median(points.noise) / tolerance_mm)
     needed = int(np.clip((COVERAGE * count / MEAN_SHARE) ** 2, LEAST_POINTS, MOST_POINTS))
     means = _average(points, needed)
-    places = _list_places(deviation, points, means, needed, tolerance_mm)
+    places, doubts = _list_places(deviation, points, means, needed, tolerance_mm)
     U = COVERAGE * means.sigma
     off = np.abs(means.value)
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
@@ -122,7 +124,7 @@ def judge_deviation(
     area = deviation.area.percent_measured() or 0.0
     spot = 2 * float(np.percentile(means.radius, 95))
     gap, gap_place = deviation.area.largest_gap
-    doubts = list(_list_doubts(deviation, area, least_area, gap))
+    doubts += _list_doubts(deviation, area, least_area, gap)
     doubtful: set[Decision] = {"undecided"} if doubts else set()
     decision = "fail" if places else worst_decision({lowest[1], highest[1]} | doubtful)
     signed = deviation.signed[deviation.counted]
@@ -250,8 +252,9 @@ def _median_radius(points: _Points, count: int) -> float:
 
 def _list_places(
     deviation: Deviation, points: _Points, means: _Means, count: int, tolerance: float
-) -> tuple[DeviatingPlace, ...]:
-    """Return the connected areas out of tolerance, the worst first."""
+) -> tuple[tuple[DeviatingPlace, ...], list[str]]:
+    """Return the connected areas out of tolerance, the worst first, and in words those that may be
+    noise."""
     single = _Means(
         points.value, np.hypot(points.noise, points.common), means.radius, 0 * means.radius
     )
@@ -275,7 +278,7 @@ def _list_places(
         is_better = wider.bound(times) > bound[suspect]
         bound[suspect[is_better]] = wider.bound(times)[is_better]
         means = _replace(means, suspect[is_better], wider.take(is_better))
-    means, bound = _join_small(points, means, bound, tolerance, median_spacing(tree, 2000))
+    means, bound, doubts = _join_small(points, means, bound, tolerance, median_spacing(tree, 2000))
     area, link = deviation.area, max(deviation.area.spacing_mm, float(np.median(means.radius)))
     found = list[DeviatingPlace]()
     missing = np.flatnonzero(np.abs(np.nan_to_num(area.deviation)) > tolerance + area.spacing_mm)
@@ -294,19 +297,20 @@ def _list_places(
                 )
             )
     found.sort(key=lambda each: -abs(each.value_mm))
-    return tuple(found[:MOST_PLACES])
+    return tuple(found[:MOST_PLACES]), doubts
 
 
 def _join_small(
     points: _Points, means: _Means, bound: Floats, tolerance: float, spacing: float
-) -> tuple[_Means, Floats]:
+) -> tuple[_Means, Floats, list[str]]:
     """Return the means, and what they exceed for certain, with connected points beyond the
-    tolerance taken together where no mean holds them: what is thinner than a mean, as a rib.
+    tolerance taken together where no mean holds them: what is thinner than a mean, as a rib; and
+    in words those that may be noise.
 
     That points were chosen as large ones makes their mean too large by what noise about the
     tolerance would, the mean of a normal distribution cut off at `SUSPECT`.
     """
-    noise, bound = points.noise, bound.copy()
+    noise, bound, doubts = points.noise, bound.copy(), list[str]()
     link, limit = JOINED * spacing, SUSPECT * tolerance
     cut = (limit - tolerance) / noise
     chosen_by = noise * norm.pdf(cut) / norm.sf(cut)
@@ -327,7 +331,13 @@ def _join_small(
                 spread = every * points.value[kept].std()
                 joined = _Means(value * every, sigma * every, means.radius[own], spread)
                 means = _replace(means, own, joined)
-    return means, bound
+            elif sign * value - DOUBT_SIGMAS * sigma > tolerance:
+                place = " ".join(f"{x:.1f}" for x in points.place[own].mean(axis=0))
+                doubts.append(
+                    f"{len(own)} points at x y z {place} mm of the model lie {value:.3f} mm off,"
+                    " which may be noise: scan there again, from nearer, and merge"
+                )
+    return means, bound, doubts
 
 
 def _replace(means: _Means, which: np.ndarray, others: _Means) -> _Means:
