@@ -3,6 +3,6 @@
 A `sequence.PatternSequence` describes which image follows which (`presets` has ready-made ones,
 `patterns` renders them); `decode.decode` converts the captured frames to a `phase.PhaseMap`:
 absolute phase, modulation, background, measured noise, and a reason for every pixel that is masked.
-`reference` is the definition in NumPy, `kernels` the fast implementation, `origin` estimates the
+`kernels` decode, `tests/decode_reference.py` is their definition in NumPy, `origin` estimates the
 conventions of captures from other tools.
 """

@@ -1,4 +1,4 @@
-"""Decoding of the frames of a capture to a phase map, by kernels. `reference` is the definition."""
+"""Decoding of the frames of a capture to a phase map, by kernels."""
 
 import math
 
@@ -24,18 +24,15 @@ from slviewer.fringe.levels import (
     unambiguous_px,
 )
 from slviewer.fringe.phase import Noise, PhaseMap
-from slviewer.fringe.reference import (
+from slviewer.fringe.phase_shifting import (
     code_bits,
     complete_map,
     dark_sigmas,
-    decode_reference,
     estimate_level_errors,
     phase_shift,
 )
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
-
-__all__ = ["decode", "decode_reference", "texture"]
 
 
 def decode(

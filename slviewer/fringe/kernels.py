@@ -1,4 +1,4 @@
-"""Phase shift, compiled; `reference` is the definition that it must agree with.
+"""Phase shift, compiled; defined by `tests/decode_reference.py`.
 
 A row of the image at a time, so that sums and codes stay in the cache while each frame is read
 once. Loops over a row have no branches and no library calls: the compiler turns them into vector

@@ -1,5 +1,4 @@
-"""Decoding of Gray code with a phase shift, compiled; `reference` is the definition that it must
-agree with."""
+"""Decoding of Gray code with a phase shift, compiled; defined by `tests/decode_reference.py`."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Decoding of Gray code alone, compiled; `reference` is the definition that it must agree with."""
+"""Decoding of Gray code alone, compiled; defined by `tests/decode_reference.py`."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Multi-frequency decoding, compiled; `reference` is the definition that it must agree with."""
+"""Multi-frequency decoding, compiled; defined by `tests/decode_reference.py`."""
 
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ class Ladder(NamedTuple):
 
     ``weights`` (levels, m) of the m wrapped phases and ``periods`` (levels,) px describe the
     levels, longest first. ``misfit``, and ``ripples`` (m, k) that are added to the wrapped phases:
-    see `reference.estimate_level_errors`; ``cell_misfit``: see `levels.cell_misfit`.
+    see `phase_shifting.estimate_level_errors`; ``cell_misfit``: see `levels.cell_misfit`.
 
     The first level begins at ``low`` px, or, where there are Gray ``bits``, is unwrapped by the
     cells that they number: frames (b,), most significant bit first, and of their ``inverses``, -1

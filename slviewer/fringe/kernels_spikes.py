@@ -2,9 +2,9 @@
 apply it to a map.
 
 The rule is also compiled for CUDA devices (`geometry.cuda_device.device_function`);
-`reference_spikes` is the definition that it must agree with. All changes are listed before the
-first is made, because a pixel's neighbours vote with their original phase. Nearly every pixel
-agrees with its four neighbours, and is skipped at the speed of memory.
+`tests/decode_reference.py` defines it. All changes are listed before the first is made, because a
+pixel's neighbours vote with their original phase. Nearly every pixel agrees with its four
+neighbours, and is skipped at the speed of memory.
 """
 
 import math

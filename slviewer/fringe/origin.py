@@ -8,7 +8,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.frame_light import FrameLight, equalize_frames
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phase_shift
+from slviewer.fringe.phase_shifting import bit_heights, dark_limit, dark_sigmas, phase_shift
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 LINES = 150

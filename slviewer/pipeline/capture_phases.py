@@ -18,7 +18,7 @@ from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import axis_layout, to_eight_bits, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.reference import dark_limit, dark_sigmas
+from slviewer.fringe.phase_shifting import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.examination import examine_frames, load_examination, load_or_save_examination

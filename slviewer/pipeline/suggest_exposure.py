@@ -15,8 +15,8 @@ from slviewer.devices.protocols import CameraSettings, Rig, find_full_scale, rep
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.layout import Layout, axis_layout
 from slviewer.fringe.limits import DARK_LEVELS
+from slviewer.fringe.phase_shifting import dark_sigmas, phase_shift
 from slviewer.fringe.plateau import find_plateau
-from slviewer.fringe.reference import dark_sigmas, phase_shift
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.operation import Progress, ignore_progress
 

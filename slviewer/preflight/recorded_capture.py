@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.examination.light import look_at
 from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.reference import dark_limit, dark_sigmas
+from slviewer.fringe.phase_shifting import dark_limit, dark_sigmas
 from slviewer.fringe.response import measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames

@@ -31,7 +31,7 @@ from slviewer.fringe.kernels import (
 from slviewer.fringe.kernels_coded import EDGE, FAR_EDGE, UNDECIDED, WEAK, WEAKER
 from slviewer.fringe.kernels_spikes import INVALID, TURN, UNCHANGED, UP, SpikeRules, spike_rules
 from slviewer.fringe.layout import Layout
-from slviewer.fringe.reference import dark_sigmas
+from slviewer.fringe.phase_shifting import dark_sigmas
 from slviewer.geometry.cuda_device import device_function
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import MARGIN, ray_depth

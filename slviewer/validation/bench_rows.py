@@ -47,12 +47,11 @@ def row(
     seconds: float,
     megabytes: float | None = None,
     floor: float | None = None,
-    definition: float | None = None,
     *,
     note: str = "",
     target: float | tuple[float, str] | None = None,
 ) -> Row:
-    """One row of the table; ``floor`` and ``definition`` in seconds, for the ratios.
+    """One row of the table; ``floor`` in seconds, for the ratio.
 
     ``target``: the most seconds on two cores at 1600x1200, and how the table states them where not
     in milliseconds.
@@ -66,7 +65,6 @@ def row(
         "MB": megabytes,
         "floor ms": None if floor is None else 1e3 * floor,
         "ratio to floor": None if floor is None else seconds / floor,
-        "ratio NumPy / kernel": None if definition is None else definition / seconds,
         "target": text,
         "holds": (
             "" if most_s is None or seconds != seconds else "yes" if seconds <= most_s else "no"

@@ -3,14 +3,15 @@ taken for it."""
 
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from facts import missing_facts
 from fringe_scene import capture, slope, variants, wrong
 
 from slviewer.examination.examine import examine
 from slviewer.fringe import decode as decode_module
-from slviewer.fringe import reference
+from slviewer.fringe import phase_shifting
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
-from slviewer.fringe.decode import decode, decode_reference
+from slviewer.fringe.decode import decode
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import complementary, multifrequency, phase_steps
@@ -28,7 +29,7 @@ TRUTH = slope(240, 320)
 
 def decode_uncorrected(monkeypatch, sequence, stack, axis="x"):
     with monkeypatch.context() as patch:
-        patch.setattr(reference, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
+        patch.setattr(phase_shifting, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
         return decode(sequence, stack, axis)
 
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from decode_reference import repair_spikes
 from fringe_scene import capture, coverage, slope, variants, wrong
 
 from slviewer.fringe.decode import decode
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import complementary, p18
-from slviewer.fringe.reference_spikes import repair_spikes
 
 PROJECTOR = (912, 1140)
 SEQUENCES = {"p18": p18(PROJECTOR), "complementary": complementary(PROJECTOR, 8, 18.0)}

@@ -2,11 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from facts import raises
 from fringe_scene import capture, coverage, slope, variants, wrong
 
 from slviewer.errors import InputError
-from slviewer.fringe.decode import decode, decode_reference, texture
+from slviewer.fringe.decode import decode, texture
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
 from slviewer.fringe.sequence import Frame, PatternSequence

@@ -5,11 +5,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from fringe_scene import variants
 from scipy.ndimage import uniform_filter
 
 from slviewer.fringe import indirect_light
-from slviewer.fringe.decode import decode, decode_reference
+from slviewer.fringe.decode import decode
 from slviewer.fringe.decoding_task import prepare_decoding
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from fringe_scene import capture, slope, variants
 
-from slviewer.fringe.decode import decode, decode_reference, pack_shifts
+from slviewer.fringe.decode import decode, pack_shifts
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18, phase_steps
 from slviewer.fringe.sequence import PatternSequence

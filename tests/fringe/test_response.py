@@ -9,7 +9,7 @@ from facts import raises
 from fringe_scene import variants
 
 from slviewer.errors import InputError
-from slviewer.fringe import reference
+from slviewer.fringe import phase_shifting
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.decode import decode
 from slviewer.fringe.patterns import profile, render_pattern
@@ -79,7 +79,7 @@ def ripple_rad(phase, coordinate):
 def test_phase_errors_of_gamma_shrink_with_the_table_on_a_plane(
     monkeypatch, steps, before_rad, times
 ):
-    monkeypatch.setattr(reference, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
+    monkeypatch.setattr(phase_shifting, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
     rig = letter(0.25, local_distortion_px=0, gamma=2.2)
     renderer = Renderer(rig, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0]))))
     plain = complementary(rig.projector.size, steps, 36.0)

@@ -4,9 +4,10 @@ contain."""
 import cv2
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from fringe_scene import capture, slope, variants
 
-from slviewer.fringe.decode import decode, decode_reference
+from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.scatter import BLOCKINESS, SIGNIFICANT, measure_scatter
 

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from facts import raises
 from fringe_scene import capture, coverage, slope, variants, wrong
 from scipy.ndimage import gaussian_filter
 
 from slviewer.errors import InputError
-from slviewer.fringe.decode import decode, decode_reference
+from slviewer.fringe.decode import decode
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import (
     bits_for,

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from facts import missing_facts, raises
 
 from slviewer.devices.protocols import Rig, stated_full_scale
@@ -21,7 +22,6 @@ from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import gray, phase_steps
-from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.capture_phases import capture_texture, loss_warnings

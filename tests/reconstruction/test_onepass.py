@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from facts import raises
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
@@ -14,7 +15,6 @@ from slviewer.errors import InputError
 from slviewer.fringe.decode import texture
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
-from slviewer.fringe.reference import decode_reference
 from slviewer.reconstruction import onepass_kernels as kernels
 from slviewer.reconstruction.onepass import OnePass
 

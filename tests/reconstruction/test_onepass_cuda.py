@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from facts import missing_facts, raises
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
@@ -23,7 +24,6 @@ from slviewer.errors import InputError
 from slviewer.fringe.decode import texture
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18, short
-from slviewer.fringe.reference import decode_reference
 from slviewer.geometry import cuda_device
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig

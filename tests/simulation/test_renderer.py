@@ -5,11 +5,11 @@ from dataclasses import replace
 import numba
 import numpy as np
 import pytest
+from decode_reference import decode_reference
 from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18, phase_steps
-from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.simulation.boards import BoardShape, Pose, blank_board, printed_board
 from slviewer.simulation.film import psf_taps

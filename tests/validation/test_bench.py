@@ -34,14 +34,13 @@ def test_the_floor_reads_and_writes_every_byte() -> None:
 def test_the_table_and_its_json() -> None:
     frames = np.zeros((2, 500, 1000), np.uint8)
     table = Benchmark(
-        [row("decode", 0.003, megabytes(frames), 0.002, 0.06)], None, (missing("no-such-peer"),)
+        [row("decode", 0.003, megabytes(frames), 0.002)], None, (missing("no-such-peer"),)
     )
     assert (
         missing_facts(table.text(), "decode", "no-such-peer", "pip install 'slviewer[bench]'") == []
     )
     stage = json.loads(json.dumps(table.to_json()))["stages"][0]
     assert stage["MB"] == 1.0 and abs(stage["ratio to floor"] - 1.5) < 1e-9
-    assert abs(stage["ratio NumPy / kernel"] - 20) < 1e-9
     assert missing("numpy") == ""
 
 

@@ -1,4 +1,5 @@
-"""Decoding in NumPy: the definition that the kernels must reproduce."""
+"""Phase shifting, Gray bits and levels in NumPy, for what needs them of a few pixels, and what is
+common to every decoded map."""
 
 import numpy as np
 
@@ -10,12 +11,10 @@ from slviewer.fringe.aliased_harmonics import (
     estimate_aliased_harmonics,
 )
 from slviewer.fringe.cosines import FEWEST, select_rows
-from slviewer.fringe.decoding_task import DecodingTask, prepare_decoding
-from slviewer.fringe.frame_light import FrameLight
+from slviewer.fringe.decoding_task import DecodingTask
 from slviewer.fringe.indirect_light import mask_indirect_light
 from slviewer.fringe.layout import Layout
 from slviewer.fringe.levels import (
-    cell_misfit,
     code_cell_px,
     layout_levels,
     lowest_coordinate,
@@ -23,10 +22,9 @@ from slviewer.fringe.levels import (
     unambiguous_px,
     unwrap_levels,
 )
-from slviewer.fringe.phase import Noise, PhaseMap, Reason
-from slviewer.fringe.reference_spikes import repair_spikes
+from slviewer.fringe.phase import Noise, PhaseMap
 from slviewer.fringe.scatter import with_scatter
-from slviewer.fringe.sequence import Axis, Indices, PatternSequence
+from slviewer.fringe.sequence import Indices
 from slviewer.fringe.threshold import fringe_mean
 
 TWO_PI = 2 * np.pi
@@ -37,49 +35,6 @@ AGREEMENT = 0.02
 AMPLITUDES = np.linspace(-0.4, 0.4, 33)
 """Of ripples that are tried: a gamma of 2.2 has one of 0.29 in three steps."""
 _ARGUMENTS = np.linspace(-np.pi, np.pi, 1025)
-
-
-def decode_reference(
-    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
-) -> PhaseMap:
-    """Decode one axis without kernels, like `decode.decode`: same wrapped phase to 1e-5 rad,
-    absolute to 1e-4 rad."""
-    task = prepare_decoding(sequence, stack, axis, light)
-    layout, stack, noise, white = task.layout, task.stack, task.noise, task.white
-    if not layout.shifts:
-        phase, modulation, background, inconsistent, dark = _decode_gray_alone(layout, stack, noise)
-        wrapped = np.full_like(phase, np.nan)
-        weakest, saturated = modulation, np.zeros(phase.shape, bool)
-    else:
-        shifted = [
-            phase_shift(stack, shift.indices, layout.sign, layout.offset_rad)
-            for shift in layout.shifts
-        ]
-        wrapped, modulation, background, _ = shifted[-1]
-        weakest = np.minimum.reduce([b for _, b, _, _ in shifted])
-        saturated = np.logical_or.reduce(
-            [(peak >= white) & (a + b >= white) for _, b, a, peak in shifted]
-        )
-        if layout.numbers_periods:
-            order, inconsistent = _decode_period_order(
-                layout, stack, wrapped, modulation, background
-            )
-        else:
-            cell = _decode_cell(layout, stack, modulation, background) if layout.gray else None
-            ripples, misfit = estimate_level_errors(task)
-            wrapped_all = _add_ripples([psi for psi, _, _, _ in shifted], ripples)
-            order, inconsistent = _unwrap_by_levels(layout, wrapped_all, cell, misfit)
-        phase = (wrapped + TWO_PI * order).astype(np.float32)
-        dark = np.zeros(phase.shape, bool)
-    dark |= weakest < dark_limit(background, noise, task.full_scale, dark_sigmas(layout))
-    reason = np.select(
-        [saturated, dark, inconsistent],
-        [Reason.SATURATED, Reason.DARK, Reason.INCONSISTENT],
-        Reason.VALID,
-    ).astype(np.uint8)
-    phase[reason != Reason.VALID] = np.nan
-    phase, reason = repair_spikes(layout, phase, reason)
-    return complete_map(task, (phase, wrapped, modulation, background, reason))
 
 
 def complete_map(
@@ -176,42 +131,7 @@ def bit_heights(layout: Layout, stack: np.ndarray, index: int, threshold: np.nda
     return frame - threshold
 
 
-def _decode_period_order(
-    layout: Layout,
-    stack: np.ndarray,
-    wrapped: np.ndarray,
-    modulation: np.ndarray,
-    background: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the periods to add to the wrapped phase, and where this order is inconsistent, (h, w)
-    each."""
-    code, bit, heights = _read_code(layout, stack, layout.gray, background)
-    least = np.min(np.abs(heights), axis=0)
-    turns = wrapped * np.float32(1 / TWO_PI) - np.float32(layout.gray_origin_px / layout.period_px)
-    whole = np.floor(turns)
-    part = turns - whole  # of a period, since the code edge
-    undecided = np.float32(limits.UNDECIDED_BIT) * modulation
-    middle = (part >= 0.25) & (part < 0.75)
-    if layout.complementary is not None:
-        last = bit_heights(layout, stack, layout.complementary, background)
-        half = 2 * code + (bit ^ (last > 0))
-        # Near an order's edge the half-period cells on both sides count as one; the phase decides
-        # between them.
-        order = np.where(middle, half >> 1, ((half + 1) >> 1) - (part >= 0.75))
-        inconsistent = np.where(middle, least, np.abs(last)) < undecided
-    else:
-        ahead, behind, _ = _detect_border_pixels(layout, stack, code, heights)
-        order = (
-            code
-            + (ahead & (part < np.float32(limits.EDGE)))
-            - (behind & (part >= np.float32(1 - limits.EDGE)))
-        )
-        inner = (part >= np.float32(limits.EDGE)) & (part < np.float32(1 - limits.EDGE))
-        inconsistent = inner & (least < undecided)
-    return order - whole, inconsistent
-
-
-def _read_code(
+def read_code(
     layout: Layout, stack: np.ndarray, bits: Indices, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the binary number (h, w) int32 that Gray bits encode, its last digit, and the bits'
@@ -223,7 +143,7 @@ def _read_code(
     return np.tensordot(places, digits.astype(np.int32), 1), digits[-1].astype(np.int32), heights
 
 
-def _detect_border_pixels(
+def detect_border_pixels(
     layout: Layout, stack: np.ndarray, code: np.ndarray, heights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where a pixel is at the upper and at the lower border of its cell, (h, w) bool each.
@@ -255,7 +175,7 @@ def _detect_border_pixels(
     )
 
 
-def _decode_cell(
+def decode_cell(
     layout: Layout, stack: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the coordinate px of the cell that the Gray bits number, and where it is undecided,
@@ -264,8 +184,8 @@ def _decode_cell(
     The coordinate is the middle of the cell, or its border where the bit that changes there is near
     the middle of black and white. It is undecided where any other bit is.
     """
-    code, _, heights = _read_code(layout, stack, code_bits(layout), background)
-    ahead, behind, least = _detect_border_pixels(layout, stack, code, heights)
+    code, _, heights = read_code(layout, stack, code_bits(layout), background)
+    ahead, behind, least = detect_border_pixels(layout, stack, code, heights)
     part = np.where(ahead, 1.0, np.where(behind, 0.0, 0.5))
     undecided = least < np.float32(limits.UNDECIDED_BIT) * modulation
     return layout.gray_origin_px + code_cell_px(layout) * (code + part), undecided
@@ -277,26 +197,7 @@ def code_bits(layout: Layout) -> Indices:
     return (*layout.gray, *(() if layout.complementary is None else (layout.complementary,)))
 
 
-def _unwrap_by_levels(
-    layout: Layout,
-    wrapped: list[np.ndarray],
-    cell: tuple[np.ndarray, np.ndarray] | None,
-    misfit: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the periods to add to the finest wrapped phase, and where levels or cell are
-    inconsistent, (h, w) each.
-
-    ``cell``: see `_decode_cell`, None without Gray code; ``misfit``: see `estimate_level_errors`.
-    """
-    order, turns = _unwrap(layout, wrapped, None if cell is None else cell[0])
-    inconsistent = np.zeros(order.shape, bool) if cell is None else cell[1]
-    for k, each in enumerate(turns):
-        largest = cell_misfit(layout) if cell is not None and k == 0 else misfit
-        inconsistent = inconsistent | (np.abs(each - np.rint(each)) > largest)
-    return order, inconsistent
-
-
-def _unwrap(
+def unwrap(
     layout: Layout, wrapped: list[np.ndarray], near: np.ndarray | None
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return order and turns of `levels.unwrap_levels` for the levels of a layout."""
@@ -325,14 +226,14 @@ def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
     for _, B, A, peak in shifted:
         dark = dark_limit(A, task.noise, task.full_scale, dark_sigmas(layout))
         valid &= (dark <= B) & (peak < task.white)
-    near = _decode_cell(layout, stack, *shifted[-1][1:3])[0][valid] if layout.gray else None
+    near = decode_cell(layout, stack, *shifted[-1][1:3])[0][valid] if layout.gray else None
     wrapped = [psi[valid] for psi, _, _, _ in shifted]
     if len(wrapped[0]) < FEWEST or len(layout_levels(layout)) < 2:
         return none, limits.LEVEL_MISFIT
 
     def measure_turns(ripples: np.ndarray) -> np.ndarray:
         """Return the steps (levels, p), in periods, whole where the levels agree."""
-        turns = _unwrap(layout, _add_ripples(wrapped, ripples), near)[1]
+        turns = unwrap(layout, add_ripples(wrapped, ripples), near)[1]
         return np.array(turns[layout.gray != () :])
 
     def measure_loss(ripples: np.ndarray) -> float:
@@ -353,7 +254,7 @@ def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
     return best, float(np.clip(0.5 - np.log(1000) * sigma**2, 0.02, limits.LEVEL_MISFIT))
 
 
-def _add_ripples(wrapped: list[np.ndarray], ripples: np.ndarray) -> list[np.ndarray]:
+def add_ripples(wrapped: list[np.ndarray], ripples: np.ndarray) -> list[np.ndarray]:
     """Add ripples, see `estimate_level_errors`, to the wrapped phases of all periods."""
     if not ripples.size:
         return wrapped
@@ -361,62 +262,3 @@ def _add_ripples(wrapped: list[np.ndarray], ripples: np.ndarray) -> list[np.ndar
         psi + np.interp(psi, _ARGUMENTS, ripple).astype(np.float32)
         for psi, ripple in zip(wrapped, ripples, strict=True)
     ]
-
-
-def _decode_gray_alone(
-    layout: Layout, stack: np.ndarray, noise: Noise
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return phase, modulation, background, inconsistent and dark, (h, w) each, from Gray bits
-    alone.
-
-    One undecided bit whose two readings are neighbouring columns puts the pixel on the border
-    between them.
-    """
-    modulation, background = measure_gray_contrast(layout, stack)
-    part_of_sigma = np.sqrt(0.5 if layout.inverse else 1.5)
-    sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background) * np.float32(
-        part_of_sigma
-    )
-    limit = np.maximum(
-        np.float32(limits.GRAY_UNDECIDED_SIGMAS) * sigma,
-        np.float32(limits.GRAY_UNDECIDED_PART) * modulation,
-    )
-    code, other = np.zeros(modulation.shape, np.int32), np.zeros(modulation.shape, np.int32)
-    bit, flipped = np.zeros_like(code), np.zeros_like(code)
-    doubts = np.zeros_like(code)
-    for i in layout.gray:
-        height = bit_heights(layout, stack, i, background)
-        doubt = np.abs(height) < limit
-        bit ^= height > 0
-        flipped ^= (height > 0) ^ doubt
-        code, other = 2 * code + bit, 2 * other + flipped
-        doubts += doubt
-    inconsistent = (doubts > 1) | (np.abs(code - other) > 1)
-    # At the projector's ends only a part of a cell may have been shown.
-    cell, origin = layout.gray_cell_px, layout.gray_origin_px
-    start, end = (
-        origin + cell * np.minimum(code, other),
-        origin + cell * (np.maximum(code, other) + 1.0),
-    )
-    first, last = np.maximum(start, -0.5), np.minimum(end, layout.extent - 0.5)
-    centre = 0.5 * np.where(first < last, first + last, start + end)
-    phase = (TWO_PI / cell * centre).astype(np.float32)
-    return phase, modulation, background, inconsistent, doubts >= limits.DARK_BITS
-
-
-def measure_gray_contrast(layout: Layout, stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return modulation and background (h, w) float32 of Gray code alone, in grey levels.
-
-    Half of white - black and their mean, or else from the bits and their inverses.
-    """
-    if layout.white is not None and layout.black is not None:
-        white, black = (stack[i].astype(np.float32) for i in (layout.white, layout.black))
-        return (white - black) * np.float32(0.5), (white + black) * np.float32(0.5)
-    modulation = np.zeros(stack.shape[1:], np.float32)
-    background = np.zeros(stack.shape[1:], np.float32)
-    for i, j in zip(layout.gray, layout.inverse, strict=True):
-        gray, inverse = stack[i].astype(np.float32), stack[j].astype(np.float32)
-        modulation += np.abs(gray - inverse)
-        background += gray + inverse
-    scale = np.float32(0.5 / len(layout.gray))
-    return modulation * scale, background * scale
