@@ -288,7 +288,8 @@ def _list_places(
         samples = missing[np.sign(area.deviation[missing]) == sign]
         together = np.concatenate([points.place[own], area.counterpart[samples]])
         for members in label_clusters(together, link):
-            if len(members) < MIN_PLACE:
+            # one spike before an open place is the counterpart of all its samples
+            if len(np.unique(together[members], axis=0)) < MIN_PLACE:
                 continue
             measured, places = own[members[members < len(own)]], members[members >= len(own)]
             found.append(
