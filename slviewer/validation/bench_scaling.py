@@ -14,12 +14,15 @@ import cv2
 import numba
 import numpy as np
 
-from slviewer.calibration.observe import Observation
+from slviewer.calibration.observe import Observation, observe
 from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
-from slviewer.fringe.decode import decode
+from slviewer.fringe.decode import decode, texture
+from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.operations.batch import batch
+from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.operation import Progress, track
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
@@ -28,10 +31,12 @@ from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.scenes import Scene
 from slviewer.simulation.turning import STEPS, turning
+from slviewer.target.board import Board
+from slviewer.target.detect import detect
 from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import Row, median, row, run_python
-from slviewer.validation.rendered_calibration import observe_rendered, scan_sequence
 from slviewer.wizard.pose_plan import Planner
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import RigView
@@ -249,3 +254,19 @@ def _time_batches(scene: Any) -> list[Row]:
                 row(f"batch of {BATCH} captures, workers: {workers}", seconds[-1], note=note)
             )
     return rows
+
+
+def observe_rendered(rig: SimulatedRig, scene: Scene, name: str, number: int) -> Observation:
+    """The observation of a rendered target pose, whose noise ``number`` seeds. Raises InputError
+    where no board is detected."""
+    sequence = p18(rig.projector.size)
+    frames = Renderer(rig, scene).capture(sequence, number)
+    board = Board.parse(TARGET)
+    return observe(
+        name, board, detect(board, texture(sequence, frames)), decode_frames(name, sequence, frames)
+    )
+
+
+def scan_sequence(rig: SimulatedRig) -> PatternSequence:
+    """The patterns of axis x alone, with which scans are captured."""
+    return one_axis(p18(rig.projector.size), "x")

@@ -44,9 +44,9 @@ from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene, Spheres
-from slviewer.simulation.truth import PerfectModel
-from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
+from tests.perfect_model import PerfectModel
 from tests.proofs.proof import BandCheck, Proof, prove_checks
+from tests.rendered_calibration import calibrate_rendered, render_phase
 
 POSES = 25
 COVERED = 6

@@ -28,17 +28,17 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene
 from slviewer.simulation.second_camera import second_camera
-from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
-from slviewer.validation.rendered_calibration import (
+from tests.perfect_model import PerfectModel
+from tests.proofs.accuracy import FLOOR, covered_pixels, measure_shapes, spacing_errors
+from tests.proofs.proof import BandCheck, Proof, prove_checks
+from tests.rendered_calibration import (
     calibrate_observed,
     calibrate_rendered,
     render_phase,
     scan_sequence,
 )
-from tests.proofs.accuracy import FLOOR, covered_pixels, measure_shapes, spacing_errors
-from tests.proofs.proof import BandCheck, Proof, prove_checks
 
 POSES = 16
 TURN_RAD = 0.001

@@ -24,15 +24,15 @@ from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.plans import planes, rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.rendered_calibration import (
+from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, plan_next_pose
+from tests.perfect_model import PerfectModel
+from tests.proofs.proof import Proof
+from tests.rendered_calibration import (
     calibrate_observed,
     observe_rendered,
     render_phase,
 )
-from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, plan_next_pose
-from tests.proofs.proof import Proof
 
 BOARD = Board.parse(TARGET)
 POSES, RIGS = 12, 5

@@ -30,9 +30,7 @@ from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.decals import (
     MarkedScene,
     cylinder_mesh,
-    marked_cylinder,
     marked_plate,
-    marked_sphere,
 )
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import pose_at
@@ -44,8 +42,9 @@ from slviewer.surface.fuse import fuse
 from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board
-from slviewer.validation.rendered_calibration import calibrate_rendered, scan_sequence
+from tests.marked_scenes import marked_cylinder, marked_sphere
 from tests.proofs.proof import BandCheck, Proof, prove_checks
+from tests.rendered_calibration import calibrate_rendered, scan_sequence
 
 POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01

@@ -27,10 +27,10 @@ from slviewer.simulation.plans import objects, planes, pose_at, rotation, sphere
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene
-from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.rendered_calibration import render_phase
+from tests.perfect_model import PerfectModel
 from tests.proofs.proof import BandCheck, Proof, prove_checks
+from tests.rendered_calibration import render_phase
 
 LEAST_GAIN = 5.0
 """Of p18's error over micro's, RMS without any mask, in the groove that is judged."""

@@ -17,9 +17,10 @@ from slviewer.simulation.plans import letter_plan, planes
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene
-from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation import rendered_calibration
+from slviewer.validation import bench_scaling
+from tests import rendered_calibration
+from tests.perfect_model import PerfectModel
 from tests.proofs import accuracy
 from tests.proofs.accuracy import (
     FLOOR,
@@ -55,7 +56,8 @@ def proof() -> Proof:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rendered_calibration, "TARGET", TARGET)
-        patch.setattr(rendered_calibration, "p18", few_steps)
+        patch.setattr(bench_scaling, "TARGET", TARGET)
+        patch.setattr(bench_scaling, "p18", few_steps)
         patch.setattr(rendered_calibration, "calibrate_splined", calibrate)
         patch.setattr(accuracy, "letter_plan", small_plan)
         patch.setattr(accuracy, "rig_cases", lambda *of: {"coarse": rig_cases(*of)["coarse"]})

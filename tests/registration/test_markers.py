@@ -25,12 +25,13 @@ from slviewer.registration.markers import (
 from slviewer.registration.multiway import Starts, register_all
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose
-from slviewer.simulation.decals import MarkedScene, marked_cylinder, marked_plate, marked_sphere
+from slviewer.simulation.decals import MarkedScene, marked_plate
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
-from slviewer.simulation.truth import PerfectModel
 from slviewer.target.coded import detect_markers, draw_marker_sheet, marker_modules
+from tests.marked_scenes import marked_cylinder, marked_sphere
+from tests.perfect_model import PerfectModel
 
 pytestmark = pytest.mark.computes
 

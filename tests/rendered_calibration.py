@@ -3,21 +3,17 @@
 from collections.abc import Mapping
 
 from slviewer.calibration.centres import calibrate_centres
-from slviewer.calibration.observe import Observation, observe
+from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
-from slviewer.fringe.decode import texture
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.operation import Progress, track
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
-from slviewer.target.board import Board
-from slviewer.target.detect import detect
+from slviewer.validation.bench_scaling import observe_rendered, scan_sequence
 
 
 def calibrate_rendered(
@@ -51,23 +47,7 @@ def calibrate_observed(
     return stereo, calibrate_splined(observations, stereo), observations
 
 
-def observe_rendered(rig: SimulatedRig, scene: Scene, name: str, number: int) -> Observation:
-    """The observation of a rendered target pose, whose noise ``number`` seeds. Raises InputError
-    where no board is detected."""
-    sequence = p18(rig.projector.size)
-    frames = Renderer(rig, scene).capture(sequence, number)
-    board = Board.parse(TARGET)
-    return observe(
-        name, board, detect(board, texture(sequence, frames)), decode_frames(name, sequence, frames)
-    )
-
-
 def render_phase(renderer: Renderer, name: str, number: int) -> PhaseMap:
     """The phase of axis x of a rendered scan, whose noise ``number`` seeds."""
     sequence = scan_sequence(renderer.rig)
     return decode_frames(name, sequence, renderer.capture(sequence, number))["x"]
-
-
-def scan_sequence(rig: SimulatedRig) -> PatternSequence:
-    """The patterns of axis x alone, with which scans are captured."""
-    return one_axis(p18(rig.projector.size), "x")
