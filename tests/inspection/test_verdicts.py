@@ -159,3 +159,31 @@ def test_the_mirror_image_and_another_scale_are_named() -> None:
         assert fact in reason and bool(fact) == bool(reason)
     with raises(WrongPart, "25.4"):
         deviation(25.4 * points, model, normals=normals, sigma_mm=NOISE, views=None)
+
+
+@pytest.mark.parametrize("off, decision", [(0.205, "pass"), (0.215, "undecided"), (0.245, "fail")])
+def test_a_row_of_points_that_may_be_noise_does_not_pass(off: float, decision: str) -> None:
+    points, normals = scan(PART)
+    row = np.column_stack([np.linspace(5, 7, 7), np.full(7, -12.0), np.full(7, off)])
+    _, verdict = judge(
+        np.concatenate([points, row]), np.concatenate([normals, np.tile([0.0, 0, 1], (7, 1))])
+    )
+    assert verdict.decision == decision
+    assert bool(verdict.places) == (decision == "fail")
+    if decision == "undecided":
+        (doubt,) = verdict.doubts
+        assert doubt.startswith("7 points at x y z 6.0 -12.0 0.2 mm of the model lie 0.21")
+
+
+@pytest.mark.parametrize("spikes, decision", [(1, "pass"), (3, "fail")])
+def test_one_spike_is_no_counterpart_of_an_open_place(spikes: int, decision: str) -> None:
+    points, normals = scan(PART)
+    found, _ = judge(points, normals)
+    area, bottom = found.area, np.array([-8.0, 10.0, -PLATE])
+    near = np.argsort(np.linalg.norm(area.places - bottom, axis=1))[:18]
+    deviates, counterpart = area.deviation.copy(), area.counterpart.copy()
+    deviates[near] = -7.0
+    counterpart[near] = bottom + [[0.1 * (i % spikes), 0, 7] for i in range(18)]
+    changed = replace(found, area=replace(area, deviation=deviates, counterpart=counterpart))
+    verdict = judge_deviation(changed, np.full(len(points), NOISE), TOLERANCE)
+    assert verdict.decision == decision
