@@ -31,8 +31,8 @@ LEAST_POINTS, MOST_POINTS = 6, 64
 FAIL_SIGMAS = {1: 3.0, 2: 2.5, 4: 2.0, 8: 2.0}
 """Standard deviations by which a mean fails, by how many times as many points it averages: there
 are hundreds of the smallest."""
-DOUBT_SIGMAS = 1.0
-"""Standard deviations by which points that lie beside each other keep a part from passing."""
+DOUBT_SIGMAS = 1.5
+"""Standard deviations by which few points beside each other keep a part from passing."""
 SINGLE_SIGMAS = 4.0
 """Standard deviations by which single points fail, `MIN_PLACE` or more of `BESIDE` neighbours."""
 BESIDE = 8
@@ -125,6 +125,8 @@ def judge_deviation(
     spot = 2 * float(np.percentile(means.radius, 95))
     gap, gap_place = deviation.area.largest_gap
     doubts += _list_doubts(deviation, area, least_area, gap)
+    if not (places or doubts):
+        doubts += _doubt_small(points, tolerance_mm)
     doubtful: set[Decision] = {"undecided"} if doubts else set()
     decision = "fail" if places else worst_decision({lowest[1], highest[1]} | doubtful)
     signed = deviation.signed[deviation.counted]
@@ -333,12 +335,30 @@ def _join_small(
                 joined = _Means(value * every, sigma * every, means.radius[own], spread)
                 means = _replace(means, own, joined)
             elif sign * value - DOUBT_SIGMAS * sigma > tolerance:
-                place = " ".join(f"{x:.1f}" for x in points.place[own].mean(axis=0))
-                doubts.append(
-                    f"{len(own)} points at x y z {place} mm of the model lie {value:.3f} mm off,"
-                    " which may be noise: scan there again, from nearer, and merge"
-                )
+                doubts.append(_describe_doubt(len(own), points.place[own].mean(axis=0), value))
     return means, bound, doubts
+
+
+def _doubt_small(points: _Points, tolerance: float) -> Iterator[str]:
+    """Yield where the mean of the fewest neighbours lies out of tolerance, though not that of as
+    many as noise demands: dirt."""
+    large = np.flatnonzero(np.abs(points.value) > tolerance)
+    if len(large) < MIN_PLACE:
+        return
+    means = _average(points, LEAST_POINTS, large)
+    beyond = np.abs(means.value) - DOUBT_SIGMAS * means.sigma
+    if beyond.max() > tolerance:
+        worst = int(np.argmax(beyond))
+        yield _describe_doubt(LEAST_POINTS, points.place[large[worst]], means.value[worst])
+
+
+def _describe_doubt(count: int, at: Floats, value: float) -> str:
+    """Return what keeps a part from passing where a few points lie off."""
+    place = " ".join(f"{x:.1f}" for x in at)
+    return (
+        f"{count} points at x y z {place} mm of the model lie {value:.3f} mm off, which may be"
+        " noise: scan there again, from nearer, and merge"
+    )
 
 
 def _replace(means: _Means, which: np.ndarray, others: _Means) -> _Means:

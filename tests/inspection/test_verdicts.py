@@ -187,3 +187,19 @@ def test_one_spike_is_no_counterpart_of_an_open_place(spikes: int, decision: str
     changed = replace(found, area=replace(area, deviation=deviates, counterpart=counterpart))
     verdict = judge_deviation(changed, np.full(len(points), NOISE), TOLERANCE)
     assert verdict.decision == decision
+
+
+def test_a_speck_of_dirt_that_may_be_noise_does_not_pass() -> None:
+    points, normals = scan(PART)
+    hidden = np.linalg.norm(points - [6.0, -12.0, 0.0], axis=1) < 0.6
+    points, normals = points[~hidden], normals[~hidden]
+    height = TOLERANCE * np.array([1.9, 1.8, 1.5, 1.4, 1.05, 0.97, 0.96, 0.88, 0.81])
+    across = 0.3 * np.stack(np.meshgrid([0, -1, 1], [0, -1, 1]), -1).reshape(-1, 2)
+    order = np.argsort(np.linalg.norm(across, axis=1), kind="stable")
+    dirt = np.column_stack([across[order] + [6.0, -12.0], height])
+    found, _ = judge(
+        np.concatenate([points, dirt]), np.concatenate([normals, np.tile([0.0, 0, 1], (9, 1))])
+    )
+    rough = judge_deviation(found, np.full(len(points) + 9, TOLERANCE / 3), TOLERANCE)
+    assert rough.decision == "undecided" and not rough.places
+    assert rough.doubts[0].startswith("6 points at x y z 6.")
