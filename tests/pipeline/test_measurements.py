@@ -251,7 +251,7 @@ def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(
 ) -> None:
     with raises(InputError):
         measure(folder, balls, "distance", (0, 0), tops[0])
-    with raises(InputError, "balls"):
+    with raises(UsageError, "-1"):
         measure(folder, balls, "point", (-1, 5))
     with raises(UsageError, "pixel"):
         measure(folder, balls, "point", 7)

@@ -13,7 +13,7 @@ from clocks import HANG_S
 from facts import raises
 from PIL import Image
 
-from slviewer.errors import DamagedError, InputError
+from slviewer.errors import DamagedError, InputError, UsageError
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.operation import save_record
@@ -90,9 +90,11 @@ def test_details_are_remembered_and_shown_as_typed(session: Path, tmp_path: Path
 def test_impossible_details_are_refused_and_damaged_ones_named(
     session: Path, tmp_path: Path
 ) -> None:
-    for wrong in ({"part": "x" * 201}, {"customer": "a\u202eb"}, {"temperature": 900.0}):
+    for wrong in ({"part": "x" * 201}, {"customer": "a\u202eb"}):
         with raises(InputError):
             written(session, **wrong)
+    with raises(UsageError, "temperature", "200"):
+        written(session, temperature=900.0)
     (tmp_path / "logo.svg").write_text("<svg/>")
     with raises(InputError, "logo.svg", "PNG"):
         written(session, logo=str(tmp_path / "logo.svg"))
