@@ -39,6 +39,9 @@ BESIDE = 8
 EXTREMES, EXTREME_SHARE = 3, 2e-4
 """Means at either end that do not keep a part from passing, as few pixels on an edge do; and their
 share of large scans. More of them beside each other are a place."""
+WIDER, CHANCE_SIGMAS = 4, 3.5
+"""Times the points of a mean that the wider one about it averages; and standard deviations by which
+noise alone may carry the largest of hundreds away from that."""
 MOST_NOISE = 3.0
 """Of the median: points whose noise is larger are not counted on."""
 SUSPECT = 0.8
@@ -96,6 +99,11 @@ class _Means:
         its uncertainty, (n,) mm."""
         return np.abs(self.value) - FAIL_SIGMAS[times] * self.sigma
 
+    def noise(self, count: int) -> Floats:
+        """The standard uncertainty (n,) mm of means of ``count`` points, but for how the form
+        varies within."""
+        return np.sqrt(np.maximum(self.sigma**2 - self.variation**2 / count, 0.0))
+
 
 def judge_deviation(
     deviation: Deviation,
@@ -120,7 +128,7 @@ def judge_deviation(
     U = COVERAGE * means.sigma
     off = np.abs(means.value)
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
-    lowest, highest = (_judge_end(means, sign, needed, tolerance_mm) for sign in (-1, 1))
+    lowest, highest = (_judge_end(points, means, sign, needed, tolerance_mm) for sign in (-1, 1))
     area = deviation.area.percent_measured() or 0.0
     spot = 2 * float(np.percentile(means.radius, 95))
     gap, gap_place = deviation.area.largest_gap
@@ -162,19 +170,29 @@ def judge_limits(value: float, U: float, lower: float | None, upper: float | Non
     return "fail" if value < low - U or value > high + U else "undecided"
 
 
-def _judge_end(means: _Means, sign: int, count: int, tolerance: float) -> tuple[float, Decision]:
+def _judge_end(
+    points: _Points, means: _Means, sign: int, count: int, tolerance: float
+) -> tuple[float, Decision]:
     """Return the least or the largest local mean of ``count`` points, but for a few, and its
     decision; how the form varies within one, as across an edge, keeps it from failing, not from
-    passing."""
+    passing. A mean that noise may have carried towards the tolerance, the largest of many, does not
+    keep the part from passing where the wider one about it agrees with it and lies inside."""
     rank = min(EXTREMES + int(EXTREME_SHARE * len(means.value)), len(means.value) // 10)
     end = int(np.argsort(sign * means.value)[-1 - rank])
     value, sigma = float(means.value[end]), float(means.sigma[end])
     if sign * value - FAIL_SIGMAS[1] * sigma > tolerance:
         return value, "fail"
-    noise = np.sqrt(np.maximum(means.sigma**2 - means.variation**2 / count, 0.0))
+    noise = means.noise(count)
     noise = np.minimum(noise, MOST_NOISE * np.median(noise))  # of few points on an edge
-    reached = np.sort(sign * means.value + COVERAGE * noise)[-1 - rank]
-    return value, "pass" if reached <= tolerance else "undecided"
+    off = sign * means.value
+    reached = off + COVERAGE * noise
+    doubtful = np.flatnonzero((reached > tolerance) & (off + noise <= tolerance))
+    if len(doubtful):
+        wider = _average(points, WIDER * count, doubtful)
+        agrees = np.abs(off[doubtful] - sign * wider.value) <= CHANCE_SIGMAS * noise[doubtful]
+        limit = sign * wider.value + COVERAGE * wider.noise(WIDER * count)
+        reached[doubtful[agrees]] = limit[agrees]
+    return value, "pass" if np.sort(reached)[-1 - rank] <= tolerance else "undecided"
 
 
 def _list_points(deviation: Deviation, sigma_mm: Floats, common_mm: Floats | None) -> _Points:
@@ -191,14 +209,14 @@ def _list_points(deviation: Deviation, sigma_mm: Floats, common_mm: Floats | Non
     places = deviation.located[counted]
     common = common.astype(np.float64)
     points = _Points(places, facing, towards, value, noise, common, unmatched)
-    # the part's form does not make a best fit to it uncertain
-    share = min(1.0, float(np.median(noise)) / max(rms(value[~unmatched]), 1e-12))
     if len(points) > MOST_MEANS:
         side = deviation.area.spacing_mm * np.sqrt(len(points) / MOST_MEANS) / 3
         points = _combine(points, side)
-    spread = deviation.alignment_spread
-    J = distance_jacobian(points.place - spread.centre, points.towards)
-    aligned = share * np.sqrt(np.einsum("ni,ij,nj->n", J, spread.covariance, J))
+    # noise makes a best fit uncertain, the part's form does not
+    J = distance_jacobian(points.place - points.place.mean(axis=0), points.towards)
+    fitted = J[~points.is_unmatched]
+    covariance = np.median(points.noise) ** 2 * np.linalg.pinv(fitted.T @ fitted, hermitian=True)
+    aligned = np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J))
     return replace(points, common=np.hypot(points.common, aligned))
 
 
