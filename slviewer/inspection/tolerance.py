@@ -42,6 +42,9 @@ share of large scans. More of them beside each other are a place."""
 WIDER, CHANCE_SIGMAS = 4, 3.5
 """Times the points of a mean that the wider one about it averages; and standard deviations by which
 noise alone may carry the largest of hundreds away from that."""
+RIVAL_SIGMAS = 3.0
+"""Standard deviations by which a mean may be smaller than the largest, and have been it but for
+noise."""
 MOST_NOISE = 3.0
 """Of the median: points whose noise is larger are not counted on."""
 SUSPECT = 0.8
@@ -404,7 +407,8 @@ def _describe(
         first = measured[int(np.argmax(bound[measured]))]
         worst, place = means.value[first], points.place[first]
         # the largest of several means is too large by noise; what one averages has a larger peak
-        chosen = np.sqrt(1 + 2 * np.log(max(1.0, len(measured) / count)))
+        rivals = np.sign(worst) * means.value > abs(worst) - RIVAL_SIGMAS * means.sigma[first]
+        chosen = np.sqrt(1 + 2 * np.log(max(1.0, np.count_nonzero(rivals) / count)))
         sigma = np.hypot(chosen * means.sigma[first], means.variation[first])
     if len(samples):
         extreme = samples[int(np.argmax(np.abs(area.deviation[samples])))]
