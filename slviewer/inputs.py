@@ -35,10 +35,12 @@ class Input:
         for number in value if isinstance(value, tuple | list) else (value,):
             if isinstance(number, float | int) and not self.low <= number <= self.high:
                 stated = f"{number:g}" if abs(number) < LARGEST else str(number)[:20]
-                raise UsageError(
-                    f"{name} is {stated}: give a number from {self.low:g} to {self.high:g}"
-                    f" {self.unit}".rstrip()
-                )
+                raise UsageError(f"{name} is {stated}: give a number from {self.range}")
+
+    @property
+    def range(self) -> str:
+        """From what to what, in words."""
+        return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def title(self, name: str) -> str:
         """What a panel calls the input of that name."""

@@ -53,6 +53,7 @@ from slviewer.errors import (
 from slviewer.fringe.patterns import render_pattern as render
 from slviewer.fringe.presets import complementary, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
+from slviewer.inputs import Input
 from slviewer.pipeline.import_captures import check_imported_capture
 from slviewer.pipeline.operation import Found, Job, ignore_warnings, operation
 from slviewer.records.record import Record
@@ -72,13 +73,13 @@ from slviewer.target.board import BOARD_PLUGINS, Board, BoardType
 from slviewer.target.detect import detect
 
 if TYPE_CHECKING:
-    from slviewer.gui.panel import PanelPlugin
+    from slviewer.gui.panel import Form, PanelPlugin
 
 __all__ = [
     "Board", "BoardType", "Camera", "CameraSettings", "DetectionError", "DeviceError", "Driver",
-    "Exporter", "FolderLayout", "Found", "Frame", "ImportableRecording", "InputError", "Job",
-    "Mesh", "Openable", "PanelPlugin", "PatternSequence", "PerAxis", "PointSet", "Projector",
-    "Record", "Rig", "Turntable", "TurntableError",
+    "Exporter", "FolderLayout", "Form", "Found", "Frame", "ImportableRecording", "Input",
+    "InputError", "Job", "Mesh", "Openable", "PanelPlugin", "PatternSequence", "PerAxis",
+    "PointSet", "Projector", "Record", "Rig", "Turntable", "TurntableError",
     "check_angle", "check_board", "check_camera", "check_complete", "check_exporter", "check_frame",
     "check_importer", "check_index", "check_level", "check_projector", "check_sequence",
     "check_turntable", "define_layout", "gray_bits", "has_images", "match_images", "operation",
@@ -87,11 +88,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name != "PanelPlugin":
+    if name not in ("Form", "PanelPlugin"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from slviewer.gui.panel import PanelPlugin  # of a second: only panels need it
+    from slviewer.gui import panel  # of a second: only panels need it
 
-    return PanelPlugin
+    return getattr(panel, name)
 
 
 _SEEN_LEVEL, _OTHER_LEVEL = 85, 170

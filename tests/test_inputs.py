@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import pytest
 from facts import raises
 
+from slviewer.commands.command import read_command
 from slviewer.errors import UsageError
 from slviewer.gui.panel import Form
 from slviewer.inputs import Input, check_inputs, find_inputs
@@ -87,6 +88,11 @@ def test_a_form_has_every_declared_field_and_no_other() -> None:
     entered = form.values()
     assert entered == {"gain": 1.0, "radius": 2.0, "steps": 4} and type(entered["steps"]) is int
     assert list(Form(panel, ProbeSettings, "steps").values()) == ["steps"]  # type: ignore[arg-type]
+
+
+def test_help_states_the_declared_range() -> None:
+    described = read_command("pipeline.reconstruct:verify", "captures").__doc__ or ""
+    assert "(0.001 to 1e+06 mm)" in described
 
 
 def test_what_operations_declare_fits_their_defaults() -> None:

@@ -337,12 +337,18 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
     others = [cho_solve(cho_factor(total - N), right - b) for N, b in parts]
     for _ in range(2):  # the weights depend on the sigmas, and the sigmas on the changes
         own = [solve_change(e, g, sigmas) for e, g in zip(equations, others, strict=True)]
-        # (views, 6), (views, kinds, 6, 6), (views, 6), (views, 3)
-        changes, spreads, *rest = map(np.array, zip(*(vars(a).values() for a in own), strict=True))
-        sigmas = _fit_sigmas(changes, spreads, sigmas)
+        rows = _stack_changes(own)
+        sigmas = _fit_sigmas(rows["change"], rows["spreads"], sigmas)
     covariance = cho_solve(factor, np.eye(len(shared)))
     names = np.array([view.name for view in views])
-    return DriftReference(rig, shared, covariance, sigmas, names, changes, spreads, *rest)
+    changes = rows.pop("change")
+    return DriftReference(rig, shared, covariance, sigmas, names, changes, **rows)
+
+
+def _stack_changes(changes: Sequence[PoseChange]) -> dict[str, Floats]:
+    """Return each figure of several views' changes by its name, one row a view."""
+    names = [each.name for each in fields(PoseChange)]
+    return {name: np.array([getattr(each, name) for each in changes]) for name in names}
 
 
 def solve_change(e: LinearView, shared: Floats, sigmas: Floats) -> PoseChange:

@@ -23,7 +23,7 @@ import tyro
 
 from slviewer import terminal
 from slviewer.errors import SlviewerError
-from slviewer.inputs import Input, find_input
+from slviewer.inputs import LARGEST, Input, find_input
 
 ModelName = Literal["stereo", "pixelwise", "splined"]
 
@@ -111,7 +111,7 @@ def read_command(
         return work
 
     # each argument on one line: tyro would break the help where the source is broken
-    joined = re.sub(r"\n {8,}(?=\S)", " ", described)
+    joined = _add_ranges(re.sub(r"\n {8,}(?=\S)", " ", described), declared)
     parse.__doc__ = (description or text) + (joined and f"\n\nArgs:\n{joined}")
     parse.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     parse.__annotations__ = {each.name: each.annotation for each in parameters}
@@ -196,6 +196,16 @@ def _list_described(parts: Sequence["Described"]) -> list["Argument"]:
         for argument in arguments
         if re.search(rf"^ {{4}}{argument[0].arg}:", text, re.MULTILINE)
     ]
+
+
+def _add_ranges(described: str, declared: Mapping[str, Input]) -> str:
+    """Add to descriptions of arguments, one a line, what each may be, where that is limited."""
+    for name, limits in declared.items():
+        if limits.high < LARGEST:
+            described = re.sub(
+                rf"^( {{4}}{name}: .*)", rf"\1 ({limits.range})", described, flags=re.M
+            )
+    return described
 
 
 def _check_numbers(

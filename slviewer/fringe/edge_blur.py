@@ -225,10 +225,10 @@ def _displace(first, last, modulation, phase, sigma, noise, shift, is_continuous
                 continue
             here = max(modulation[v, u], noise)
             reach = max(1, int(np.float32(0.5) * (sigma[v, u] + np.float32(1))))
-            first, right = max(u - reach, 0), min(u + reach, width - 1)
+            left, right = max(u - reach, 0), min(u + reach, width - 1)
             top, bottom = max(v - reach, 0), min(v + reach, height - 1)
-            span_u, span_v = np.float32(max(right - first, 1)), np.float32(max(bottom - top, 1))
-            slope_u = _compute_log_ratio(modulation[v, right], modulation[v, first], here) / span_u
+            span_u, span_v = np.float32(max(right - left, 1)), np.float32(max(bottom - top, 1))
+            slope_u = _compute_log_ratio(modulation[v, right], modulation[v, left], here) / span_u
             slope_v = _compute_log_ratio(modulation[bottom, u], modulation[top, u], here) / span_v
             far = int(np.float32(2) * sigma[v, u]) + 1
             step_u, step_v = far if slope_u > 0 else -far, far if slope_v > 0 else -far

@@ -480,7 +480,8 @@ def _settle(
     slack, T = freedom.slack_mm.copy(), pose.T
     free = np.flatnonzero(slack > most / 2)
     steps = [(most * m[:3] / radius, most * m[3:]) for m in freedom.motions[free]]
-    for turn, shift in SETTLING_ROUNDS * steps if len(steps) > 1 else steps:
+    rounds = SETTLING_ROUNDS if len(steps) > 1 else 1  # one motion opens another
+    for turn, shift in rounds * steps:
         shares = np.linspace(-1, 1, 2 * SETTLING + 1)
         for width in (1.0, 1 / SETTLING):
             moves = [turn_about(w * turn, middle, w * shift) @ T for w in width * shares]
@@ -488,7 +489,7 @@ def _settle(
     for k, (turn, shift) in zip(free, steps, strict=True):
         ends = (turn_about(sign * turn, middle, sign * shift) @ T for sign in (1, -1))
         if min(mean_square(end) for end in ends) > mean_square(T) + HELD * error**2:
-            slack[k] = 0.0
+            slack[k] = 0.0  # edges hold it
     return T, Freedom(np.sort(slack), freedom.motions[np.argsort(slack)]).shape(most)
 
 

@@ -12,10 +12,12 @@ from typing import Any
 import pytest
 from clocks import HANG_S
 from copies import copy_session
+from facts import missing_facts
 from playwright.sync_api import Browser, expect
-from wizard_page import CALM, choose, click, new_page, unfold, wait_until
+from wizard_page import CALM, choose, click, field, new_page, unfold, wait_until
 
 from slviewer.cli import main
+from slviewer.errors import UsageError
 from slviewer.gui.app import App
 from slviewer.pipeline.certificate import read_certificate, verify_report
 from slviewer.server.secure import Serving
@@ -60,6 +62,10 @@ def test_terminal_json_csv_report_and_certificate_hold_the_figure(
     }
     states = {check.what: check.state for check in verify_report(session, report).checks}
     assert states[f"brightness/{SCAN}"] == "same"
+    status, _, said = run("brightness", session, SCAN, "--brightest", "0")
+    assert status == 2 and not missing_facts(said, "--brightest", "0.1", "100")
+    with pytest.raises(UsageError):
+        import_operation().brightness(session, SCAN, brightest=101.0)
 
 
 @pytest.mark.computes
@@ -84,10 +90,13 @@ def test_its_panel_measures_and_the_page_shows_the_figure(session: Path, browser
         click(page, "6. Scan")
         unfold(page, "Brightness")
         choose(page, "Capture", SCAN)
+        field(page, "Brightest, %").fill("1")
+        field(page, "Brightest, %").press("Enter")
         click(page, "Measure brightness")
         brightness = import_operation().Brightness
         wait_until(page, lambda: bool(operator.snapshot().session.list_records(brightness)))  # type: ignore[union-attr]
         (found,) = (each.record for each in operator.snapshot().session.list_records(brightness))  # type: ignore[union-attr]
+        assert found.mean_percent > 60  # not of all pixels
         expect(page.get_by_text(f"{SCAN}: {found.mean_percent:.1f} %")).to_be_visible()
         click(page, "9. Export")
         page.get_by_text("Figures", exact=True).click()

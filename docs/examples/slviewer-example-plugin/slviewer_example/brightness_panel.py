@@ -1,7 +1,7 @@
 """A panel of the wizard: it runs the operation on the chosen capture, and shows what it found."""
 
-from slviewer.plugins import PanelPlugin
-from slviewer_example.brightness import Brightness
+from slviewer.plugins import Form, PanelPlugin
+from slviewer_example.brightness import Brightness, BrightnessSettings
 
 
 class BrightnessPanel(PanelPlugin):
@@ -12,6 +12,7 @@ class BrightnessPanel(PanelPlugin):
     def build(self) -> None:
         """Create the inputs."""
         self._capture = self.choice("Capture")
+        self._form = Form(self, BrightnessSettings)
         self._found = self._gui.add_markdown("")
         self.button("Measure brightness", self._measure)
 
@@ -27,4 +28,4 @@ class BrightnessPanel(PanelPlugin):
 
     def _measure(self) -> None:
         """Run the operation in the wizard's queue of jobs."""
-        self._operator.run("brightness", capture=self._capture.value)
+        self._operator.run("brightness", capture=self._capture.value, **self._form.values())
