@@ -294,12 +294,12 @@ def _list_turned(
     either = abs if not surface.is_solid else np.asarray  # of unknown sides
     model = _Faces(places @ axes, either(facing @ axes))
     unknown = np.zeros_like(points) if normals is None else normals
-    tried = [pose.T]
+    tried = [pose.T]  # the first stays as it is
     turns = RIGHT_TURNS
     if not pose.is_good:  # a plate fits roughly however it is turned in its plane
         thin = np.eye(3)[np.ptp(model.places, axis=0).argmin()]
         flat = Rotation.from_rotvec(np.outer(FLAT_TURNS, thin)).as_matrix()
-        over = 2 * np.diag(np.roll(thin, 1)) - np.eye(3)
+        over = 2 * np.diag(np.roll(thin, 1)) - np.eye(3)  # half a turn about an axis in the plane
         turns = np.concatenate([turns, flat, flat @ over])
     for R in axes @ turns @ axes.T:
         T = rigid_transform(R, middle - R @ middle) @ pose.T
@@ -309,8 +309,9 @@ def _list_turned(
     turned = None if own is None else np.concatenate([own @ T[:3, :3].T for T in tried])
     off = surface.distances(moved, turned, np.eye(4), 2 * reach)[0].reshape(len(tried), -1)
     shares, costs = np.isfinite(off).mean(axis=1), _cap(off / reach).mean(axis=1)
-    first = (*np.argsort(costs)[: RIVALS // 2], *np.argsort(-shares)[:RIVALS])
-    order = [k for k in dict.fromkeys(first) if shares[k] >= RIVAL_SHARE * shares[0]][:RIVALS]
+    # half of them by cost: what lies near the model may lie on another of its faces
+    ranked = dict.fromkeys((*np.argsort(costs)[: RIVALS // 2], *np.argsort(-shares)[:RIVALS]))
+    order = [k for k in ranked if shares[k] >= RIVAL_SHARE * shares[0]][:RIVALS]
     starts = [tried[k] for k in order if k]
     if pose.is_exact:
         return starts
