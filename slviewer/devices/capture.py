@@ -232,13 +232,16 @@ def capture_with_texture(
 def _complete(
     rig: Rig, sequence: PatternSequence, frames: np.ndarray, applied_ms: tuple[float, ...] = ()
 ) -> CapturedFrames:
-    """Return captured frames with the camera's settings and the colour texture (h, w, 3), None also
-    on a DeviceError: the frames are complete without it."""
-    texture, lens = None, dict[str, float]()
-    with report_driver_faults(rig.camera):
+    """Return captured frames with the camera's settings, its colour texture (h, w, 3) and its lens,
+    as far as its driver gives them: the frames are complete, and kept, without.
+
+    ``applied_ms``: the exposures that were set, none for a single one.
+    """
+    settings, texture, lens = CameraSettings(), None, dict[str, float]()
+    with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):
         settings = rig.camera.settings()
-        with contextlib.suppress(DeviceError):
-            texture = capture_colour(rig)
+    with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):
+        texture = capture_colour(rig)
     with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):
         lens = read_lens(rig.camera)
     return CapturedFrames(frames, settings, sequence, rig.name, applied_ms, texture, lens)

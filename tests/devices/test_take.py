@@ -108,16 +108,26 @@ def test_a_colour_camera_brings_its_colours_home():
         np.testing.assert_allclose(
             ratio.mean(axis=0), [ColouredCamera.RED, 1, ColouredCamera.BLUE], atol=0.02
         )
-    with coloured(rig()).opened() as one:
-
-        def gone() -> np.ndarray:
-            raise DeviceError("the video has ended")
-
-        one.camera.grab_colour, one.camera.grab = gone, one.camera._camera.grab
-        taken = capture_with_texture(one, SEQUENCE)
-        assert taken.texture is None and taken.frames.any()  # the frames are whole
     with rig().opened() as grey:
         assert capture_colour(grey) is None
+
+
+@pytest.mark.parametrize("fault", [DeviceError("the video has ended"), RuntimeError("no buffer")])
+@pytest.mark.parametrize("call", ["grab_colour", "settings"])
+def test_what_fails_after_the_last_frame_loses_none(call: str, fault: Exception):
+    with coloured(rig()).opened() as one:
+
+        def fail() -> np.ndarray:
+            raise fault
+
+        one.camera.grab = one.camera._camera.grab
+        setattr(one.camera, call, fail)
+        taken = capture_with_texture(one, SEQUENCE)
+        assert len(taken.frames) == N and taken.frames[-1].any()
+        if call == "settings":
+            assert taken.settings == CameraSettings() and taken.texture is not None
+        else:
+            assert taken.settings.exposure_ms and taken.texture is None
 
 
 class _Page:
