@@ -27,6 +27,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
 from slviewer.geometry.rigid import Floats, Mask
+from slviewer.geometry.robust import RAYLEIGH_MEDIAN
 from slviewer.geometry.splines import SplineSurface, fit_spline
 from slviewer.geometry.vectors import finite_rows, lengths, rms
 from slviewer.target.board import Board
@@ -59,6 +60,9 @@ MIN_FEATURES = 12
 """Nine unknowns, and some features more."""
 OUTLIER_SIGMAS = 6.0
 """Features with a larger residual, in robust sigma, are outliers."""
+MIN_OUTLIER_PX = 0.5
+"""What the homography and one bend leave of a real lens is smaller: no feature is an outlier for
+it."""
 MIN_TOLERANCE_PX = 1.0
 TOLERANCE_RATIO = 4.0
 """Tolerance of a pixel's coordinate: 1 px plus four times the largest residual of a feature. Beyond
@@ -91,8 +95,8 @@ class BoardPlane:
 
     @classmethod
     def fit(cls, camera: Floats, projector: Floats, size: tuple[int, int]) -> "BoardPlane | None":
-        """Fit the plane robustly to features at ``camera`` and ``projector`` pixels (n, 2), NaN
-        where unknown.
+        """Fit the map from camera to projector that a plane makes, robustly, to features at
+        ``camera`` and ``projector`` pixels (n, 2), NaN where unknown.
 
         ``size``: (width, height) px of the camera. None where fewer than MIN_FEATURES inliers
         remain.
@@ -108,7 +112,8 @@ class BoardPlane:
                 return None
             residual = lengths(plane.predict(camera[:, 0], camera[:, 1]) - projector)
             before, typical = inlier, np.median(residual[inlier])
-            inlier = residual < np.maximum(OUTLIER_SIGMAS * typical / 1.1774, 0.5)
+            limit = max(OUTLIER_SIGMAS * typical / RAYLEIGH_MEDIAN, MIN_OUTLIER_PX)
+            inlier = residual < limit
             if np.array_equal(inlier, before):
                 break
         return plane

@@ -26,6 +26,7 @@ from slviewer.geometry.rigid import (
     move_points,
     transform_from_rvec,
 )
+from slviewer.geometry.robust import RAYLEIGH_MEDIAN
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
 from slviewer.geometry.vectors import (
     finite_rows,
@@ -392,7 +393,7 @@ def _detect_outliers(model: StereoModel) -> dict[str, Mask]:
     # in the camera and projector
     errors = {name: lengths(r.reshape(-1, 2, 2)) for name, r in model.residuals_px.items()}
     typical = np.nanmedian(np.concatenate([*errors.values()]), axis=0)
-    limit = np.maximum(ROBUST_SIGMAS * typical / 1.1774, 0.05)  # Rayleigh
+    limit = np.maximum(ROBUST_SIGMAS * typical / RAYLEIGH_MEDIAN, 0.05)
     outliers = {name: (each > limit).any(1) for name, each in errors.items()}
     return {name: is_outlier for name, is_outlier in outliers.items() if is_outlier.any()}
 

@@ -121,6 +121,7 @@ def disable_automatics(capture: cv2.VideoCapture, words: Dialect) -> dict[str, s
     for what, control, off in words.automatics:
         if (now := capture.get(control)) == UNKNOWN:
             continue
+        # some drivers take a control out of its automatic mode when its present value is written
         wanted = now if off is None else off
         if not (capture.set(control, wanted) and capture.get(control) == wanted):
             notices[f"automatic {what}"] = (

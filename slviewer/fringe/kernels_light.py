@@ -9,8 +9,8 @@ from slviewer.geometry.jit import kernel
 def equalize(
     first, last, stack, frames, gain, offset, along_rows, along_columns, albedo, scale, out
 ):
-    """Fill ``out`` (k, h, w) uint16: frames (k,) of the stack less their room light, over their
-    gain, times ``scale``.
+    """Fill ``out`` (k, h, w) uint16: the stack's frames of indices ``frames`` (k,) less their room
+    light, over their gain, times ``scale``; never the 65535 that marks clipped pixels.
 
     ``gain`` (k, h); room light ``offset[k] + albedo (along_rows[k, y] + along_columns[k] (x / (w -
     1) - 0.5))``, with ``albedo`` (h, w), or (0, 0) where there is none in proportion to it.

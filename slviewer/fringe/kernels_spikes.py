@@ -62,22 +62,22 @@ def spike_rules(layout: Layout) -> SpikeRules:
     """Return the rules for the phases of a layout."""
     period = 2 * np.pi
     # Gray code alone has no period: neighbouring cells agree
-    cell = (
+    cell_rad = (
         period
         if layout.shifts
         else period * max(limits.GRAY_CELL_PX / layout.gray_cell_px, limits.GRAY_CELLS)
     )
     unambiguous, low, high = unambiguous_px(layout), -np.inf, np.inf
-    if not np.isfinite(unambiguous):
+    if not np.isfinite(unambiguous):  # absolute: of columns -0.5 ... extent - 0.5
         low, high = -0.5 - limits.OUTSIDE_PX, layout.extent - 0.5 + limits.OUTSIDE_PX
     per_px = period / layout.period_px
     return SpikeRules(
-        cell,
+        cell_rad,
         layout.is_plain,
         layout.origin_rad,
-        low * per_px,
-        high * per_px,
-        unambiguous / layout.period_px,
+        low_rad=low * per_px,
+        high_rad=high * per_px,
+        repeat=unambiguous / layout.period_px,
     )
 
 

@@ -9,6 +9,8 @@ from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
 
 Solution = TypeVar("Solution")
+RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
+"""Median length of a 2D error whose components are normal, in their standard deviation."""
 
 
 def robust_sigma(residuals: Floats, about: float | None = None) -> float:

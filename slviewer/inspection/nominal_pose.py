@@ -268,8 +268,9 @@ def _improve_pose(
     """Return the pose of least cost among those turned by right angles about the model's main axes,
     as a plate fits in four ways but for its small features; and where no pose is good, by a few
     degrees from there; the pose itself where noise alone is left."""
-    reach = REACH * surface.diagonal
-    if pose.is_exact and pose.is_good and pose.cost <= NOISE_COST * ((sigma_mm or 0) / reach) ** 2:
+    # costs are squares of reaches; where the noise is not known, it excuses nothing
+    noise_cost = ((sigma_mm or 0) / (REACH * surface.diagonal)) ** 2
+    if pose.is_exact and pose.is_good and pose.cost <= NOISE_COST * noise_cost:
         return pose
     for _ in range(TURN_ROUNDS):
         starts = _list_turned(points, normals, surface, pose)

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from slviewer.errors import InputError, SlviewerError, UsageError
+from slviewer.errors import Cancelled, InputError, SlviewerError, UsageError
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import (
     datum_frame,
@@ -173,16 +173,16 @@ def inspect_surfaces(
                 scales[surface.model] = surface.scale
             try:
                 aligned = AlignedPart(plan, surface, nominal)
-            except WrongPart:
+            except (WrongPart, Cancelled):
                 raise
             except SlviewerError as error:
                 raise InputError(f"not aligned: {error}") from error
             results = tuple(
                 judge_characteristic(each, aligned, plan.min_area) for each in plan.characteristic
             )
-        except SlviewerError as error:
-            if error.exit_status == 130:  # cancelled
-                raise
+        except Cancelled:
+            raise
+        except SlviewerError as error:  # one that cannot be measured is no reason to fail it
             decision: Decision = "fail" if isinstance(error, WrongPart) else "undecided"
             results = tuple(
                 CharacteristicResult(each.name, None, None, decision, str(error))

@@ -111,7 +111,8 @@ class CudaPass(OnePass):
     def _run_on_processor(
         self, frames: np.ndarray, light: LightLevels, out: PassResult | None = None
     ) -> PassResult:
-        """Compute a scan on the processor, in the arrays of ``out`` where given."""
+        """Compute a scan on the processor: of a table in the arrays of ``out`` where given, of
+        stereo, which has no kernels of one pass, stage by stage in new ones."""
         if not isinstance(self.model, StereoModel):
             return super().run(frames, light, out)
         decoded = decode(self.sequence, frames, self.axis)
@@ -122,10 +123,10 @@ class CudaPass(OnePass):
             points,
             decoded.phase,
             decoded.reason,
-            self.model.sigma_z(decoded, points),
-            decoded.modulation,
-            texture(self.sequence, frames),
-            replace(light, noise=decoded.noise),
+            sigma_z=self.model.sigma_z(decoded, points),
+            modulation=decoded.modulation,
+            texture=texture(self.sequence, frames),
+            light=replace(light, noise=decoded.noise),
         )
 
 

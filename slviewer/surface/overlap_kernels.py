@@ -130,10 +130,11 @@ def measure_heights(first, last, p, n, reach, gate, grid, heights):
 @kernel()
 def add_votes(first, last, p, gate, points, witnesses, to_pixel, votes):
     """Add a scan's votes on points ``p`` (k, 3) mm in its frame; only its pixels ``witnesses`` (h,
-    w) bool vote.
+    w) bool vote, with its surface ``points`` (h, w, 3) mm.
 
     Adds 1 to ``votes`` (k,) where its surface is within ``gate`` mm in depth, and -1 where the
-    surface is more than 1.5 gates behind the point, which is thus in the scan's free space.
+    surface is more than 1.5 gates behind the point, which is thus in the scan's free space. A
+    surface in front hides the point, and one between both is undecided: no vote.
     """
     for i in range(first, last):
         y, x = pixel_of(p[i, 0], p[i, 1], p[i, 2], to_pixel, witnesses.shape)

@@ -187,20 +187,21 @@ def _verify_grid(board: Board, image: BoardImage, grid: Floats) -> Floats:
 
 
 def _detect_grids(board: Board, grey: np.ndarray) -> Iterator[Floats]:
-    """Yield grids (rows, columns, 2) px, good to a pixel or two, along the board's rows.
+    """Yield grids (rows, columns, 2) px of the board's size, good to a pixel or two, of any
+    orientation, of which the caller takes the first that is right.
 
     They are those of OpenCV's sector-based search, the largest grid if it has the board's size, and
-    that of OpenCV's older search, from square to square.
+    that of OpenCV's older search, which links squares by their corners.
     """
-    full, shape = min(1.0, SEARCH_PX / max(grey.shape)), (board.rows, board.columns, 2)
+    scale, shape = min(1.0, SEARCH_PX / max(grey.shape)), (board.rows, board.columns, 2)
     even = flatten_light(grey)
     thorough = cv2.CALIB_CB_EXHAUSTIVE
-    for source, factor, flags in (
-        (even, full / 2, 0),
-        (grey, full / 2, 0),
-        (even, full / 2, thorough),
-        (even, full, thorough),
-        (grey, full, 0),
+    for source, factor, flags in (  # the fastest first
+        (even, scale / 2, 0),
+        (grey, scale / 2, 0),
+        (even, scale / 2, thorough),
+        (even, scale, thorough),
+        (grey, scale, 0),
     ):
         success, corners = cv2.findChessboardCornersSB(
             resize_image(source, factor), board.features, flags=flags
@@ -211,9 +212,9 @@ def _detect_grids(board: Board, grey: np.ndarray) -> Iterator[Floats]:
     largest = _detect_largest(grey)
     if largest is not None and sorted(largest.shape[:2]) == sorted(board.features):
         yield largest if largest.shape[0] == board.rows else largest.transpose(1, 0, 2)
-    success, corners = cv2.findChessboardCorners(resize_image(grey, full / 2), board.features)
+    success, corners = cv2.findChessboardCorners(resize_image(grey, scale / 2), board.features)
     if success:
-        yield to_full_image(corners, full / 2).reshape(shape)
+        yield to_full_image(corners, scale / 2).reshape(shape)
 
 
 def _detect_largest(grey: np.ndarray) -> Floats | None:

@@ -50,10 +50,11 @@ def _read(path: Path, data: bytes) -> list[Columns]:
     try:
         for i in range(file.scan_count):
             header = file.get_header(i)
-            values = file.read_scan(i, colors=True, ignore_missing_fields=True)
-            names = [(f"cartesian{each.upper()}", each) for each in PLACE]
-            names += [(f"color{each.title()}", each) for each in COLOURS]
-            columns = {ours: values[theirs] for theirs, ours in names if theirs in values}
+            # transformed into the file's frame, in which the header states the scanner's place
+            values = file.read_scan(i, colors=True, transform=True, ignore_missing_fields=True)
+            fields = [(f"cartesian{each.upper()}", each) for each in PLACE]
+            fields += [(f"color{each.title()}", each) for each in COLOURS]
+            columns = {ours: values[theirs] for theirs, ours in fields if theirs in values}
             scans.append(columns | ({"sensor": header.translation} if header.has_pose() else {}))
     finally:
         file.close()

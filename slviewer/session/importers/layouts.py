@@ -191,26 +191,25 @@ Images = Mapping[tuple[int, ...], Path]
 def _define_numbered(
     name: str,
     holds: str,
-    file: str,
+    stem: str,
     order: Callable[..., tuple[PatternSequence, Iterable[Path]]],
-    **projector: Any,
+    **known: Any,
 ) -> FolderLayout:
-    """Return a layout of images whose stems match the pattern ``file``, which ``order(images,
-    projector, ...)`` explains by a sequence, with the files in its order."""
-    pattern = re.compile(file, re.IGNORECASE)
+    """Return a layout of images whose stems match the regular expression ``stem``, which
+    ``order(images, size of the projector, **options of the layout)`` explains by a sequence, with
+    the files in its order; ``known``: of the projector, as `define_layout` takes it."""
+    pattern = re.compile(stem, re.IGNORECASE)
 
     def describe(
-        folder: Path, name: str, projector: tuple[int, int] | None, **options: Any
+        folder: Path, recording: str, size: tuple[int, int] | None, **options: Any
     ) -> tuple[ImportableRecording, list[str]]:
         """Return the recording of one folder, and warnings."""
         images, others = match_images(folder, pattern)
-        sequence, files = order(images, projector, **options)
-        recording = ImportableRecording(name, sequence, tuple(files), folder, unknown=tuple(others))
-        return recording, []
+        sequence, files = order(images, size, **options)
+        unknown = tuple(others)
+        return ImportableRecording(recording, sequence, tuple(files), folder, unknown=unknown), []
 
-    return define_layout(
-        name, holds, describe, lambda folder: has_images(folder, pattern), **projector
-    )
+    return define_layout(name, holds, describe, lambda folder: has_images(folder, pattern), **known)
 
 
 _P18_STEPS, _P18_PERIOD_PX, _P18_BITS = 18, 18.0, 7

@@ -60,13 +60,15 @@ def convert_entries(
         if for_rows:
             K = K.T
         elif f"{start}.RadialDistortion" not in storage.entries:
-            continue
+            continue  # neither transposed nor named as MATLAB's
+        # MATLAB counts pixels from 1
         converted[f"K_{device}"] = K - [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
         radial = matrices[f"D_{device}"].ravel()
         if radial.size in (2, 3):
-            start = keys[f"D_{device}"].rpartition("RadialDistortion")[0]
-            tangential = storage.entries.get(f"{start}TangentialDistortion")
+            prefix = keys[f"D_{device}"].rpartition("RadialDistortion")[0]
+            tangential = storage.entries.get(f"{prefix}TangentialDistortion")
             p = np.zeros(2) if tangential is None else tangential.ravel()[:2]
+            # OpenCV's order: k1, k2, p1, p2, k3
             converted[f"D_{device}"] = np.concatenate([radial[:2], p, radial[2:]])
     R, T = matrices["R"], matrices["T"]
     if R.shape == (4, 4):
