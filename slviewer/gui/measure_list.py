@@ -243,44 +243,50 @@ class MeasurementList(PanelPart):
             )
             self._file = Text(gui)
 
-    def update(self, on: str) -> list[Stored[Measurement]]:
-        """Show the session's measurements, in 3D those on the surface ``on``; returns the new
-        ones."""
+    def update(self, surface: str) -> list[Stored[Measurement]]:
+        """Show the session's measurements, in 3D those on the ``surface``; returns the new ones."""
         session, measured = self.panel.session, self.panel.session.measurements
-        names = [each.name for each in measured]
         values = {each.name: [q.value for q in each.record.quantities] for each in measured}
-        before = self.chosen and self.chosen.name
+        previous = self.chosen and self.chosen.name
         if session.folder != self._folder:
-            self._folder, self._known, before = session.folder, values, None
-            # the measurements of another session have the same ids
-            self._layer.remove(*self._drawn)
-            self._drawn, self._lines = {}, {}
-            for show in (self._show_drawings, self._histogram.set, self._show_section):
-                self._painter.cancel(show)
+            self._open_session(session.folder, values)
+            previous = None
         new = [each for each in measured if each.name not in self._known]
         self._remember(values)
-        # the latest first, by their names; by their ids too where names occur twice
-        titles = list(name_records(measured))
-        options = dict(zip(titles[::-1], names[::-1], strict=True))
-        self._choice.offer(options, follow=True)
-        self._chosen_folder.visible = self._table_folder.visible = bool(measured)
+        self.chosen = self._offer(measured)
+        # at the opening nothing is new, and nothing was chosen: the surface stays as it is
+        was_opened = previous is None and not new
+        self.is_other = (self.chosen and self.chosen.name) != previous and not was_opened
         self._restore.visible = session.deleted_measurements > 0
         self._file.set(self.context.links_html(session.exports, TABLE, PLAN))
-        chosen = next((each for each in measured if each.name == self._choice.value), None)
-        # at the opening of a session the surface stays as it is
-        self.is_other = (chosen and chosen.name) != before and (bool(new) or before is not None)
-        self.chosen = chosen
         labels = scan_labels(session)
         if merge := session.merge:
             labels[f"merge/{merge.name}"] = f"merge of {len(merge.record.scans)} scans"
         self._table.set(measurements_table(measured, labels) if measured else "")
-        self._details.set(measurement_html(chosen, labels) if chosen else "")
-        self._draw_deviation(chosen)
-        self._draw_section(chosen, on)
-        self._request_drawings(measured, chosen, on)
+        self._details.set(measurement_html(self.chosen, labels) if self.chosen else "")
+        self._draw_deviation(self.chosen)
+        self._draw_section(self.chosen, surface)
+        self._request_drawings(measured, self.chosen, surface)
         return new
 
     # inside
+
+    def _open_session(self, folder: Path | None, values: dict[str, list[float]]) -> None:
+        """Forget the measurements of another session, which have the same ids."""
+        self._folder, self._known = folder, values
+        self._layer.remove(*self._drawn)
+        self._drawn, self._lines = {}, {}
+        for show in (self._show_drawings, self._histogram.set, self._show_section):
+            self._painter.cancel(show)
+
+    def _offer(self, measured: Sequence[Stored[Measurement]]) -> Stored[Measurement] | None:
+        """Offer the measurements, the latest first, by their names, by their ids too where names
+        occur twice; returns the chosen one."""
+        titles = list(name_records(measured))
+        names = [each.name for each in measured]
+        self._choice.offer(dict(zip(titles[::-1], names[::-1], strict=True)), follow=True)
+        self._chosen_folder.visible = self._table_folder.visible = bool(measured)
+        return next((each for each in measured if each.name == self._choice.value), None)
 
     def _remember(self, values: dict[str, list[float]]) -> None:
         """Remember the values of all measurements, and forget the lines of sections that have

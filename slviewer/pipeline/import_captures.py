@@ -227,28 +227,28 @@ def find_captures(
     files of the same names show, where it is not stated."""
     source = expand_user(source)
     with _opened_if_there(session) as store:
-        same = None if store is None else _layout_of_session(store, source)
+        session_layout = _layout_of_session(store, source)
         try:
-            chosen = _choose_layout(source, layout, sequence, same, warn)
+            chosen = _choose_layout(source, layout, sequence, session_layout, warn)
         except UnknownLayoutError as error:
             raise _suppose_layout(source, projector, channel, error) from error
-        size, assumed, assumption = None if projector is None else parse_size(projector), None, ""
-        if size is None and chosen.name != "frames":
-            if store is not None and (assumed := _known_projector_size(store)) is not None:
-                assumption = (
-                    f"the projector is assumed to have {assumed[0]}x{assumed[1]} px, as in the"
-                    " session: --projector for another size"
-                )
-            size = assumed or chosen.projector
+        # a file of frames states the size
+        is_stated = projector is not None or chosen.name == "frames"
+        assumed = None if is_stated else _known_projector_size(store)
+        size = assumed or (chosen.projector if projector is None else parse_size(projector))
+    assumption = assumed and (
+        f"the projector is assumed to have {assumed[0]}x{assumed[1]} px, as in the session:"
+        " --projector for another size"
+    )
     try:
         imports = pair_cameras(chosen.read(source, prefix=prefix, projector=size, **options))
     except InputError:
         if assumption:
             warn(assumption)  # it may be why
         raise
-    sizes = {recording.sequence.projector_size for recording in imports.recordings}
-    # a layout that states the size itself does not use the assumed one
-    if assumption and assumed in sizes - {chosen.projector}:
+    used = {recording.sequence.projector_size for recording in imports.recordings}
+    # not where the layout has that size in any case, or its files state another
+    if assumption and assumed in used and assumed != chosen.projector:
         warn(assumption)
     if channel is None:
         return imports
@@ -320,10 +320,10 @@ def _choose_layout(
     return same
 
 
-def _layout_of_session(store: Session, source: Path) -> FolderLayout | None:
+def _layout_of_session(store: Session | None, source: Path) -> FolderLayout | None:
     """The layout of folders whose files are named like, and show the same as, those of an imported
     capture of the session; None where the source holds no such folder."""
-    if not source.is_dir():
+    if store is None or not source.is_dir():
         return None
     captures = [each for each in store.captures() if each.files and not each.exposures_ms]
     same = {
@@ -348,9 +348,11 @@ def _layout_of_session(store: Session, source: Path) -> FolderLayout | None:
     return define_layout("frames", holds, describe, same.__contains__) if same else None
 
 
-def _known_projector_size(store: Session) -> tuple[int, int] | None:
+def _known_projector_size(store: Session | None) -> tuple[int, int] | None:
     """The projector's size by the session's captures, else by its imported calibration; None where
     both are missing."""
+    if store is None:
+        return None
     sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
     if not sizes and "stereo" in available_models(store):
         meta = store.load_meta("calibration/stereo")
