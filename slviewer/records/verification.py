@@ -171,13 +171,16 @@ def average(shape: Shape, found: Iterable[Verification]) -> Verification:
 
 
 def _average(fits: list[ModelFit]) -> ModelFit:
-    """Return the means of the known figures."""
+    """Return the means of the known figures, but of none that says where a shape lies, and the sums
+    of the points."""
     means: dict[str, Any] = {}
-    for figure in ("rms_mm", "noise_floor_mm", "coverage", "radius_mm", "masked"):
+    for figure in ModelFit.__struct_fields__:
         known = [value for fit in fits if (value := getattr(fit, figure)) is not None]
-        means[figure] = fmean(known) if known else None
-    points, excluded = (sum(getattr(f, name) for f in fits) for name in ("points", "excluded"))
-    return ModelFit(points, excluded, **means)
+        if figure in ("points", "excluded"):
+            means[figure] = sum(known)
+        elif figure not in ("centre_mm", "normal", "offset_mm"):
+            means[figure] = fmean(known) if known else None
+    return ModelFit(**means)
 
 
 def list_fits(found: Mapping[str, Verification], caption: str) -> Table:
