@@ -1,10 +1,11 @@
 """What can go wrong, by how the program ends.
 
-Every message states in one sentence what happened and what to do; it is shown to the operator as it
-is.
+Every error states what happened and what to do; both are shown to the operator as they are.
 """
 
 import re
+from copy import copy
+from typing import Self
 
 # up to the last @, as passwords hold all kinds of characters
 _CREDENTIALS = re.compile(r"(?<=://)[^\s\"']+(?=@)")
@@ -20,13 +21,33 @@ def hide_passwords(text: str) -> str:
 
 
 class SlviewerError(Exception):
-    """Base of all errors of slviewer; the message states what happened and what to do, without
-    passwords."""
+    """Base of all errors of slviewer, as text "place: observation: remedy" without passwords.
+
+    ``observation``: what happened; ``remedy``: what to do, "" where the observation says it;
+    ``place``: where it happened, such as the name of a capture, or "".
+    """
 
     exit_status = 1
 
+    def __init__(self, observation: str = "", remedy: str = "", place: str = "") -> None:
+        super().__init__(observation, remedy, place)
+        self.observation, self.remedy, self.place = map(
+            hide_passwords, (observation, remedy, place)
+        )
+
     def __str__(self) -> str:
-        return hide_passwords(super().__str__())
+        return ": ".join(filter(None, (self.place, self.observation, self.remedy)))
+
+    @property
+    def located_observation(self) -> str:
+        """The observation, after its place where it has one."""
+        return ": ".join(filter(None, (self.place, self.observation)))
+
+    def within(self, place: str) -> Self:
+        """Return a copy of the error with a ``place`` in front of its own."""
+        error = copy(self)
+        error.place = ": ".join(filter(None, (place, self.place)))
+        return error
 
 
 class UsageError(SlviewerError):
@@ -51,8 +72,10 @@ class BoardError(DetectionError):
     """A target that was detected, and contradicts its description or is a mirror image; ``cause``:
     that of the finding."""
 
-    def __init__(self, cause: str, message: str) -> None:
-        super().__init__(message)
+    def __init__(
+        self, observation: str = "", remedy: str = "", place: str = "", *, cause: str = ""
+    ) -> None:
+        super().__init__(observation, remedy, place)
         self.cause = cause
 
 

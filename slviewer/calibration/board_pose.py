@@ -70,8 +70,8 @@ def solve_device(
         )
     except cv2.error as error:
         raise CalibrationRejected(
-            f"the {device}'s lens could not be solved from {len(points)} poses: "
-            f"capture the board in more positions and tilts ({error.err})"
+            f"the {device}'s lens could not be solved from {len(points)} poses",
+            f"capture the board in more positions and tilts ({error.err})",
         ) from error
     poses = [transform_from_rvec(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
     fx, fy = deviations.ravel()[:2].tolist()

@@ -56,7 +56,9 @@ def centroid_shifts(lens: Lens, T_camera_board: Floats, points: Floats, radius_m
     InputError for a negative radius.
     """
     if not radius_mm >= 0:
-        raise InputError(f"circles of radius {radius_mm:g} mm were given: the radius is 0 or more")
+        raise InputError(
+            f"circles of radius {radius_mm:g} mm were given", "the radius is 0 or more"
+        )
     angles = 2 * np.pi * np.arange(CORNERS) / CORNERS
     # a regular polygon of a circle's area shares its second moments, which the shift comes from, to
     # 1e-5

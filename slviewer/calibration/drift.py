@@ -95,8 +95,8 @@ class DriftView:
         v, u = np.nonzero(observation.region)
         if not len(v):
             raise InputError(
-                f"{observation.name}: no pixel of the board carries a readable pattern: illuminate"
-                " the board"
+                f"{observation.name}: no pixel of the board carries a readable pattern",
+                "illuminate the board",
             )
         step = max(1, int(np.sqrt(len(v) / SAMPLES)))
         on_grid = (u % step == 0) & (v % step == 0)
@@ -179,7 +179,7 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
     T = solve_pose(view.points, rig.camera.undistort(view.camera), np.eye(3), np.zeros(5))
     if T is None:
         raise InputError(
-            f"{view.name}: no pose of the board fits its features: is it the calibration's board?"
+            f"{view.name}: no pose of the board fits its features", "is it the calibration's board?"
         )
     middle = view.points.mean(0)
 
@@ -308,7 +308,8 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
     if len(views) < MIN_POSES:
         raise InputError(
             f"the calibration has {len(views)} poses, and {MIN_POSES} are needed for a drift"
-            " reference: calibrate with more poses"
+            " reference",
+            "calibrate with more poses",
         )
     equations = [linearise_view(rig, view) for view in views]
     blocks = [sp.diags(RIG_SIGMAS**-2.0)]
@@ -453,8 +454,8 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     """
     if not view.axes:
         raise InputError(
-            f"{view.name}: no axis of the pattern could be read on the board: illuminate the whole"
-            " board"
+            f"{view.name}: no axis of the pattern could be read on the board",
+            "illuminate the whole board",
         )
     estimate = reference.estimate_change(view)
     growth = BOARD_PPM * 1e-6

@@ -126,8 +126,8 @@ def solve_beside(
         T = solve_pose(np.concatenate(placed), pixels, projector.K, projector.D)
     if T is None:
         raise CalibrationRejected(
-            f"the boards have no pose in the camera of {camera.name} or in the projector: check the"
-            " file, and the target's notation"
+            f"the boards have no pose in the camera of {camera.name} or in the projector",
+            "check the file, and the target's notation",
         )
     start = [projector.parameters[:LENS], *(_motion(each) for each in (T, *boards))]
     try:
@@ -136,8 +136,8 @@ def solve_beside(
         solved = Lens.from_parameters(unknowns[:LENS], size)
     except (np.linalg.LinAlgError, InputError) as error:
         raise CalibrationRejected(
-            "the poses leave the projector undetermined: capture the board in more positions and"
-            " tilts"
+            "the poses leave the projector undetermined",
+            "capture the board in more positions and tilts",
         ) from error
     count = sum(4 * len(X) for X, *_ in views) - len(unknowns)
     sigma = np.sqrt(covariance.diagonal()[:2].max() * squares / max(count, 1))

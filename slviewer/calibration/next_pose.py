@@ -176,8 +176,8 @@ def suggest(
     candidates = _list_candidates(board, lens, len(poses), illuminated)
     if not len(candidates):
         raise InputError(
-            f"the board {board} cannot be held so that the camera sees all of it: take a smaller"
-            " board"
+            f"the board {board} cannot be held so that the camera sees all of it",
+            "take a smaller board",
         )
     covered, thirds, tilts = _classify(board, lens, candidates)
     gain = (

@@ -229,10 +229,10 @@ class Smoothing:
 
     def __post_init__(self) -> None:
         if self.kind not in ("spline", "polynomial"):
-            raise InputError(f"smoothing '{self.kind}' is unknown: use 'spline' or 'polynomial'")
+            raise InputError(f"smoothing '{self.kind}' is unknown", "use 'spline' or 'polynomial'")
         if not 1 <= self.degree <= 20:
             raise InputError(
-                f"a polynomial of degree {self.degree} cannot be fitted reliably: use 1 to 20"
+                f"a polynomial of degree {self.degree} cannot be fitted reliably", "use 1 to 20"
             )
 
 
@@ -377,7 +377,8 @@ def observe(
         if np.count_nonzero(bright[axis]) < 400:
             raise DetectionError(
                 f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis}"
-                " pattern: illuminate the whole board with the projector, and raise the exposure"
+                " pattern",
+                "illuminate the whole board with the projector, and raise the exposure",
             )
     projector, slopes = _projector_pixels(detection, phases, bright, pitch)
     supported = inside.copy()
@@ -497,7 +498,7 @@ def _bounding_box(mask: Mask) -> tuple[int, int, int, int]:
     """Return (u0, v0, u1, v1) px around a mask (h, w); raises DetectionError where it is empty."""
     u0, v0, width, height = cv2.boundingRect(mask.astype(np.uint8))
     if not width:
-        raise DetectionError("the board's outline is outside the image: move the board into view")
+        raise DetectionError("the board's outline is outside the image", "move the board into view")
     return u0, v0, u0 + width, v0 + height
 
 

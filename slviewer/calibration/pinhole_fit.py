@@ -62,7 +62,8 @@ def fit_lens(pixels: Floats, rays: Floats, start: Lens) -> PinholeFit:
     known = finite_rows(rays, pixels)
     if np.count_nonzero(known) < MIN_PIXELS:
         raise InputError(
-            f"{np.count_nonzero(known)} pixels are calibrated: a lens needs at least {MIN_PIXELS}"
+            f"{np.count_nonzero(known)} pixels are calibrated",
+            f"a lens needs at least {MIN_PIXELS}",
         )
     observed, directions = pixels[known], rays[known]
 

@@ -173,8 +173,8 @@ def calibrate_pixelwise(
     used = [o for o in observations if o.name in stereo.poses]
     if len(used) < MIN_POSES:
         raise CalibrationRejected(
-            f"{len(used)} usable poses, and a pixel needs at least {MIN_POSES}: capture the board"
-            " in more positions"
+            f"{len(used)} usable poses, and a pixel needs at least {MIN_POSES}",
+            "capture the board in more positions",
         )
     depth_axis = best_axis(used, stereo)
     width, height = used[0].size
@@ -197,8 +197,8 @@ def calibrate_pixelwise(
             progress(rows.stop / height)
     if not any((fit.poses >= MIN_POSES).any() for fit in model.fits.values()):
         raise CalibrationRejected(
-            f"no pixel has a view of the board in {MIN_POSES} poses or more: let the poses overlap"
-            " in the image"
+            f"no pixel has a view of the board in {MIN_POSES} poses or more",
+            "let the poses overlap in the image",
         )
     return model
 
@@ -237,8 +237,8 @@ def mid_depth(stereo: StereoModel) -> float:
     stereo calibration."""
     if stereo.depth_range_mm is None:
         raise CalibrationRejected(
-            "the stereo calibration was imported, without poses to fit pixels to: calibrate from"
-            " target poses"
+            "the stereo calibration was imported, without poses to fit pixels to",
+            "calibrate from target poses",
         )
     return float(np.mean(stereo.depth_range_mm))
 
@@ -261,8 +261,8 @@ def ideal_plane(observation: Observation, stereo: StereoModel, axis: Axis) -> Pl
     finite = points[np.isfinite(points[:, 2])]
     if len(finite) < 100:
         raise CalibrationRejected(
-            f"{observation.name}: stereo reconstructs {len(finite)} points of the board: exclude"
-            " this pose"
+            f"{observation.name}: stereo reconstructs {len(finite)} points of the board",
+            "exclude this pose",
         )
     return fit_plane(finite)
 

@@ -340,9 +340,10 @@ def _solve_both(
     for device, f, K in zip(DEVICES, alone, (K_c, K_p), strict=True):
         if not min(K[0, 0], K[1, 1]) > 0:
             raise CalibrationRejected(
-                f"the poses give the {device} focal lengths of {K[0, 0]:.0f}, {K[1, 1]:.0f} px,"
-                " as no lens has: check the target's notation, the projector's size, the"
-                " fringe period, and that x and y are not exchanged"
+                f"the poses give the {device} focal lengths of {K[0, 0]:.0f}, {K[1, 1]:.0f} px, as"
+                " no lens has",
+                "check the target's notation, the projector's size, the fringe period, and that x"
+                " and y are not exchanged",
             )
         # systematic errors, which the standard deviations lack, change the two fits differently
         change = np.abs(f / np.diag(K) - 1).max()
@@ -356,9 +357,8 @@ def _check_focal(device: str, sigma_px: float, K: Floats) -> None:
     relative = sigma_px / float(min(K[0, 0], K[1, 1]))
     if not relative < MAX_FOCAL_SIGMA:
         raise CalibrationRejected(
-            f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f}"
-            " %: tilt the board by 15 to 30 degrees in different directions, and vary its"
-            " distance"
+            f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f} %",
+            "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
         )
 
 
@@ -374,13 +374,13 @@ def _check_agreement(model: StereoModel) -> None:
     if total["stereo"] > MAX_REPROJECTION_PX:
         raise CalibrationRejected(
             f"the reprojection error is {total['stereo']:.1f} px (camera {total['camera']:.1f},"
-            f" projector {total['projector']:.1f}), above {MAX_REPROJECTION_PX:g}: check the"
-            " target's notation, the projector's size, the fringe period, and that x and y are not"
-            " exchanged"
+            f" projector {total['projector']:.1f}), above {MAX_REPROJECTION_PX:g}",
+            "check the target's notation, the projector's size, the fringe period, and that x and y"
+            " are not exchanged",
         )
     if model.depth_range_mm is not None and model.depth_range_mm[0] <= 0:
         raise CalibrationRejected(
-            "the solution puts the board behind the camera: check the target's notation"
+            "the solution puts the board behind the camera", "check the target's notation"
         )
 
 
@@ -404,8 +404,8 @@ def check_pose_count(count: int, excluded: Mapping[str, str]) -> None:
     if count < MIN_POSES:
         why = "".join(f"; {name}: {reason}" for name, reason in excluded.items())
         raise CalibrationRejected(
-            f"{count} usable pose{'s' * (count != 1)}, and at least {MIN_POSES} are needed: "
-            f"capture the board in more positions and tilts{why}"
+            f"{count} usable pose{'s' * (count != 1)}, and at least {MIN_POSES} are needed",
+            f"capture the board in more positions and tilts{why}",
         )
 
 
@@ -419,8 +419,8 @@ def check_tilts(used: Sequence[Observation], camera: KnownCamera | None = None) 
     spread = nominal_tilt_spread_deg(used)
     if spread < MIN_TILT_SPREAD_DEG:
         raise CalibrationRejected(
-            f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees): "
-            "tilt the board by 15 to 30 degrees, in different directions"
+            f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees)",
+            "tilt the board by 15 to 30 degrees, in different directions",
         )
 
 
@@ -445,11 +445,11 @@ def check_handedness(used: Sequence[Observation]) -> None:
     if mirrored > len(used) / 2:
         raise CalibrationRejected(
             f"in {mirrored} of {len(used)} poses the projector's coordinates are a mirror image of"
-            " what the camera sees: "
-            + mirroring_remedy(
+            " what the camera sees",
+            mirroring_remedy(
                 "switch off the projector's rear or mirror mode, or exchange the x and y (V and H)"
                 " patterns"
-            )
+            ),
         )
 
 

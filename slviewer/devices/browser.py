@@ -208,7 +208,8 @@ class BrowserCamera(PageDevice[CameraChannel], CameraDriver):
         if len(content) != width * height * depth:
             raise DeviceError(
                 f"the camera page sent {len(content):,} bytes and not the"
-                f" {width * height * depth:,} of a picture: reload it"
+                f" {width * height * depth:,} of a picture",
+                "reload it",
             )
         return np.frombuffer(content, np.uint8).reshape(height, width, depth)
 
@@ -422,7 +423,7 @@ class BrowserProjector(PageDevice[ProjectorChannel]):
             page.request(op, timeout_s=timeout_s, **fields)
             if page.changes != self._changes:
                 raise DeviceError(
-                    "the projector page's window changed while patterns were shown: capture again"
+                    "the projector page's window changed while patterns were shown", "capture again"
                 )
         except BaseException:
             self._forget_loaded()

@@ -58,8 +58,9 @@ def _allocate(camera: Camera, n: int, out: np.ndarray | None = None) -> np.ndarr
         return np.empty((n, height, width), camera.dtype)
     if out.shape != (n, height, width) or out.dtype != camera.dtype:
         raise InputError(
-            f"the {n} frames of {camera.name} need {(n, height, width)} {camera.dtype}, "
-            f"got {out.shape} {out.dtype}: make the array by the camera's size"
+            f"the {n} frames of {camera.name} need {(n, height, width)} {camera.dtype}, got"
+            f" {out.shape} {out.dtype}",
+            "make the array by the camera's size",
         )
     return out
 
@@ -95,7 +96,8 @@ def _capture_loaded(
         except DeviceError as error:
             raise DeviceError(
                 f"the capture ended at frame {k + 1} of {len(places)}, and its frames were"
-                f" discarded: {error}"
+                f" discarded: {error.observation}",
+                error.remedy,
             ) from error
         report(place + 1, len(stacks[0]))
 
@@ -124,7 +126,8 @@ def _capture_burst(rig: Rig, out: np.ndarray) -> None:
     if exposure_ms and exposure_ms > burst.period_ms:
         raise DeviceError(
             f"an exposure of {exposure_ms:.4g} ms does not fit a burst with {burst.period_ms:.4g}"
-            " ms a pattern: set a shorter one, or fewer patterns a picture"
+            " ms a pattern",
+            "set a shorter one, or fewer patterns a picture",
         )
     frames = np.empty((burst.most, *out.shape[1:]), out.dtype)
     try:
@@ -155,14 +158,15 @@ def _find_first_pattern(frames: np.ndarray, burst: PatternBurst) -> int:
     if came > wanted:
         raise DeviceError(
             f"{came} frames came of a burst of {wanted}, a picture stood for two refreshes, and its"
-            " frames were discarded: end what loads this computer's graphics, then capture again"
+            " frames were discarded",
+            "end what loads this computer's graphics, then capture again",
         )
     if came < wanted:
         raise DeviceError(
             f"the trigger was lost, {came} of {wanted} frames came of a burst with"
-            f" {burst.period_ms:.3g} ms a pattern, and its frames were discarded: set an exposure"
-            " that leaves the camera time to be ready again, check the trigger's cable, or set"
-            " fewer patterns a picture"
+            f" {burst.period_ms:.3g} ms a pattern, and its frames were discarded",
+            "set an exposure that leaves the camera time to be ready again, check the trigger's"
+            " cable, or set fewer patterns a picture",
         )
     return int(bright[0]) + burst.marker
 
@@ -218,7 +222,8 @@ def capture_with_texture(
             if e and applied_ms[e] <= applied_ms[e - 1]:
                 raise DeviceError(
                     f"{rig.camera.name} set {applied_ms[e]:g} ms instead of the requested"
-                    f" {exposure:g} ms: choose exposures that it can tell apart, or a single one"
+                    f" {exposure:g} ms",
+                    "choose exposures that it can tell apart, or a single one",
                 )
             _capture_loaded(rig, (out, second), range(e * n, (e + 1) * n), progress)
     finally:
@@ -253,8 +258,8 @@ def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
     wanted = sorted(CameraSettings(exposure).exposure_ms or 0.0 for exposure in exposures_ms)
     if len(set(wanted)) < max(2, len(exposures_ms)) or len(wanted) > MAX_EXPOSURES:
         raise InputError(
-            f"exposures of {', '.join(f'{e:g}' for e in exposures_ms)} ms: give 2 to"
-            f" {MAX_EXPOSURES}, each once"
+            f"exposures of {', '.join(f'{e:g}' for e in exposures_ms)} ms",
+            f"give 2 to {MAX_EXPOSURES}, each once",
         )
     return wanted
 
@@ -267,7 +272,7 @@ def _set_exposure(rig: Rig, exposure_ms: float) -> float:
             applied_ms = camera.apply(CameraSettings(exposure_ms)).exposure_ms
     if applied_ms is None:
         raise DeviceError(
-            f"{rig.camera.name} does not report its exposure: capture in a single one"
+            f"{rig.camera.name} does not report its exposure", "capture in a single one"
         )
     return applied_ms
 

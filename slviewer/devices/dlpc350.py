@@ -8,7 +8,7 @@ of each pattern number.
 
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, Protocol
 
@@ -55,18 +55,32 @@ RUN_STOPPED, RUN_STARTED = 0, 2
 """Arguments of `Command.RUN`."""
 
 _STATUS = (
-    (Command.MAIN_STATUS, 0, 1, False, "has its mirrors parked: switch it off and on"),
-    (Command.MAIN_STATUS, 1, 0, True, "stopped its sequence: check that 912x1140 arrives by HDMI"),
-    (Command.MAIN_STATUS, 2, 1, False, "has a frozen buffer: end other programs that control it"),
-    (Command.HARDWARE_STATUS, 0, 0, False, "did not start up: switch it off and on"),
-    (Command.HARDWARE_STATUS, 2, 1, False, "has a fault in the control of its mirrors: return it"),
-    (Command.HARDWARE_STATUS, 3, 1, True, "was forced to change pictures: check refresh_hz"),
-    (Command.HARDWARE_STATUS, 6, 1, True, "aborted its sequence: check the video signal"),
-    (Command.HARDWARE_STATUS, 7, 1, True, "has an error in its sequence: switch it off and on"),
-    (Command.SYSTEM_STATUS, 0, 0, False, "failed its memory test: switch it off and on"),
+    (Command.MAIN_STATUS, 0, 1, False, "has its mirrors parked", "switch it off and on"),
+    (
+        Command.MAIN_STATUS,
+        1,
+        0,
+        True,
+        "stopped its sequence",
+        "check that 912x1140 arrives by HDMI",
+    ),
+    (Command.MAIN_STATUS, 2, 1, False, "has a frozen buffer", "end other programs that control it"),
+    (Command.HARDWARE_STATUS, 0, 0, False, "did not start up", "switch it off and on"),
+    (
+        Command.HARDWARE_STATUS,
+        2,
+        1,
+        False,
+        "has a fault in the control of its mirrors",
+        "return it",
+    ),
+    (Command.HARDWARE_STATUS, 3, 1, True, "was forced to change pictures", "check refresh_hz"),
+    (Command.HARDWARE_STATUS, 6, 1, True, "aborted its sequence", "check the video signal"),
+    (Command.HARDWARE_STATUS, 7, 1, True, "has an error in its sequence", "switch it off and on"),
+    (Command.SYSTEM_STATUS, 0, 0, False, "failed its memory test", "switch it off and on"),
 )
 """Command, bit, the value of the bit that is a fault, whether it is one of a sequence (and may be
-left of an earlier one), and what it means (guide, 2.1)."""
+left of an earlier one), what it means (guide, 2.1), and the remedy."""
 _RUNNING = 0b010
 """Lower bits of the main status: mirrors not parked, sequence running, buffer not frozen."""
 
@@ -133,9 +147,9 @@ def open_hid(serial: str | None) -> HidTransport:
     devices = [each for each in list_devices() if serial in (None, each["serial_number"])]
     if not devices:
         raise DeviceError(
-            "no LightCrafter 4500 is connected by USB"
-            f"{'' if serial is None else f' with the serial number {serial}'}: plug it in and"
-            " switch it on; `slviewer devices` lists what is connected"
+            "no LightCrafter 4500 is connected by"
+            f" USB{'' if serial is None else f' with the serial number {serial}'}",
+            "plug it in and switch it on; `slviewer devices` lists what is connected",
         )
     return HidTransport(devices[0]["path"])
 
@@ -185,8 +199,8 @@ class Dlpc350:
                 return
             if self._clock() > end:
                 raise DeviceError(
-                    f"{self._name} did not set {command.name} to {value} within {_SETTLE_S:g} s:"
-                    " switch it off and on"
+                    f"{self._name} did not set {command.name} to {value} within {_SETTLE_S:g} s",
+                    "switch it off and on",
                 )
 
     def start(self) -> None:
@@ -200,15 +214,21 @@ class Dlpc350:
     def check_running(self) -> None:
         """Raise DeviceError unless it shows pictures as they come."""
         if self.read(Command.MAIN_STATUS) & 0b111 != _RUNNING:
-            raise DeviceError(f"{self._name} {'; it '.join(self.list_faults(is_running=True))}")
+            raise self.describe_faults(self.list_faults(is_running=True))
 
-    def list_faults(self, is_running: bool) -> list[str]:
-        """Return a clause for each fault that its status reports, those of a sequence where one
-        runs."""
+    def describe_faults(self, faults: Sequence[tuple[str, str]]) -> DeviceError:
+        """Return the error of faults, each with its remedy."""
+        *others, (last, remedy) = faults or [("", "")]
+        clauses = [*(f"{fault}: {cure}" for fault, cure in others), last]
+        return DeviceError(f"{self._name} {'; it '.join(clauses)}", remedy)
+
+    def list_faults(self, is_running: bool) -> list[tuple[str, str]]:
+        """Return a clause and the remedy for each fault that its status reports, those of a
+        sequence where one runs."""
         read = {command: self.read(command) for command in {row[0] for row in _STATUS}}
         return [
-            words
-            for command, bit, fault, of_sequence, words in _STATUS
+            (clause, remedy)
+            for command, bit, fault, of_sequence, clause, remedy in _STATUS
             if read[command] >> bit & 1 == fault and (is_running or not of_sequence)
         ]
 
@@ -246,13 +266,14 @@ class Dlpc350:
             if self._clock() > end:
                 raise DeviceError(
                     f"{self._name} is busy, its check of the sequence has not ended within"
-                    f" {_SETTLE_S:g} s: switch it off and on"
+                    f" {_SETTLE_S:g} s",
+                    "switch it off and on",
                 )
         wrong = [words for bit, words in enumerate(_INVALID) if result >> bit & 1]
         if wrong:
             raise DeviceError(
-                f"{self._name} refused the sequence, {' and '.join(wrong)}: lower per_picture or"
-                " bits"
+                f"{self._name} refused the sequence, {' and '.join(wrong)}",
+                "lower per_picture or bits",
             )
         return [words for bit, words in enumerate(_WARNINGS, 2) if result >> bit & 1]
 
@@ -274,17 +295,17 @@ class Dlpc350:
                     break
         except (OSError, ValueError) as error:  # ValueError: hidapi's of a device that is closed
             raise DeviceError(
-                f"{self._name} was unplugged or switched off ({error}): plug it in again"
+                f"{self._name} was unplugged or switched off ({error})", "plug it in again"
             ) from error
         if not answer:
             raise DeviceError(
-                f"{self._name} did not answer {command.name} within {_ANSWER_S:g} s: switch it off"
-                " and on"
+                f"{self._name} did not answer {command.name} within {_ANSWER_S:g} s",
+                "switch it off and on",
             )
         length = int.from_bytes(answer[2:4], "little")
         if answer[0] & NACK or (flags & READ and not length):
             raise DeviceError(
-                f"{self._name} refused {command.name}: stop what it shows in other programs, and"
-                " update its firmware to 3.0 or newer"
+                f"{self._name} refused {command.name}",
+                "stop what it shows in other programs, and update its firmware to 3.0 or newer",
             )
         return answer[4 : 4 + length]

@@ -80,7 +80,7 @@ def driver(name: str) -> Driver:
     if name not in drivers():
         why = DRIVER_PLUGINS.explain_missing(name)
         raise InputError(
-            f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}{why}"
+            f"no driver is called {name!r}", f"use one of {', '.join(sorted(drivers()))}{why}"
         )
     selected = drivers()[name]
     if selected.missing:

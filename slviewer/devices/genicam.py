@@ -69,7 +69,7 @@ class Features:
         in it."""
         width, height = self._get_node("Width"), self._get_node("Height")
         if width is None or height is None:
-            raise DeviceError(f"{self._name} does not report its image size: use another camera")
+            raise DeviceError(f"{self._name} does not report its image size", "use another camera")
         with as_device_error(self._name):
             return int(width.value), int(height.value)
 
@@ -89,8 +89,8 @@ class Features:
         if chosen is None:
             missing = "none that can be read" if wanted is None else f"no {wanted} that can be read"
             raise InputError(
-                f"{self._name} offers {missing}: use one of {', '.join(usable) or 'another camera'}"
-                " as pixel_format"
+                f"{self._name} offers {missing}",
+                f"use one of {', '.join(usable) or 'another camera'} as pixel_format",
             )
         return chosen
 
@@ -102,7 +102,7 @@ class Features:
         """
         if wanted is not None and wanted not in get_args(Trigger):
             raise InputError(
-                f"no trigger is called {wanted!r}: use one of {', '.join(get_args(Trigger))}"
+                f"no trigger is called {wanted!r}", f"use one of {', '.join(get_args(Trigger))}"
             )
         has_mode = "On" in self._list_choices("TriggerMode")
         sources = self._list_choices("TriggerSource") if has_mode else []
@@ -113,16 +113,15 @@ class Features:
             return "software" if software else "free"
         if wanted == "software" and not software:
             raise InputError(
-                f"{self._name} has no software trigger: leave `trigger` out, and it runs free"
+                f"{self._name} has no software trigger", "leave `trigger` out, and it runs free"
             )
         lines = [source for source in sources if source not in ("Software", "Off")]
         if wanted == "hardware" and (line is None or line not in lines):
+            if not lines:
+                raise InputError(f"{self._name} has no trigger lines", "leave `trigger` out")
+            missing = f"no trigger line {line!r}" if line else "a trigger line to be named"
             raise InputError(
-                f"{self._name} has"
-                f" {f'no trigger line {line!r}' if line else 'a trigger line to be named'}: use one"
-                f" of {', '.join(lines)} as `line`"
-                if lines
-                else f"{self._name} has no trigger lines: leave `trigger` out"
+                f"{self._name} has {missing}", f"use one of {', '.join(lines)} as `line`"
             )
         return wanted
 
@@ -130,13 +129,13 @@ class Features:
         """Raise InputError for settings that the camera has no feature for."""
         if wanted.exposure_ms is not None and self._get_exposure_node() is None:
             raise InputError(
-                f"{self._name} has no exposure time that can be set: leave exposure_ms out"
+                f"{self._name} has no exposure time that can be set", "leave exposure_ms out"
             )
         if wanted.gain is not None and self._get_gain_node() is None:
             gain = self._get_node("Gain")
             why = "no gain" if gain is None else "a gain in device-specific steps of unknown factor"
             raise InputError(
-                f"{self._name} has {why}: leave `gain` out, and set it with its maker's software"
+                f"{self._name} has {why}", "leave `gain` out, and set it with its maker's software"
             )
 
     def prepare(self, chosen: PixelFormat, trigger: Trigger, line: str | None) -> None:
@@ -158,8 +157,8 @@ class Features:
             current = self._get_node("PixelFormat")
             if current is None or current.value != chosen.name:
                 raise DeviceError(
-                    f"{self._name} did not accept the pixel format {chosen.name}: choose"
-                    " another one"
+                    f"{self._name} did not accept the pixel format {chosen.name}",
+                    "choose another one",
                 )
 
     def release(self) -> None:
@@ -231,7 +230,7 @@ class Features:
         source = "Software" if trigger == "software" else line
         if not (self._choose("TriggerSource", source or "") and self._choose("TriggerMode", "On")):
             raise DeviceError(
-                f"{self._name} did not accept the trigger {source}: choose another one"
+                f"{self._name} did not accept the trigger {source}", "choose another one"
             )
 
     def _list_choices(self, name: str) -> list[str]:
@@ -357,8 +356,8 @@ class GenicamCamera(CameraDriver):
         if features.size() != self.size:
             (width, height), (columns, rows) = features.size(), self.size
             raise DeviceError(
-                f"{self.name} has images of {width}x{height} px, no longer {columns}x{rows}: choose"
-                " it anew"
+                f"{self.name} has images of {width}x{height} px, no longer {columns}x{rows}",
+                "choose it anew",
             )
         self.apply(self._first)
         self._link.start()
@@ -458,7 +457,7 @@ class GenicamCamera(CameraDriver):
         with self._link.next(timeout_s, self.pixels.nbytes) as image:
             if image.size != self.size:
                 raise DeviceError(
-                    f"{self.name} sent a frame of {image.size}, not {self.size}: choose it anew"
+                    f"{self.name} sent a frame of {image.size}, not {self.size}", "choose it anew"
                 )
             yield image
 

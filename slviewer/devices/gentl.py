@@ -57,8 +57,8 @@ def as_device_error(name: str) -> Iterator[None]:
     except _list_library_errors() as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DeviceError(
-            f"{name} does not answer: check its cable, and close other programs that use it"
-            f" ({reason})"
+            f"{name} does not answer",
+            f"check its cable, and close other programs that use it ({reason})",
         ) from error
 
 
@@ -70,8 +70,8 @@ def producer_files(producer: str | None = None) -> list[str]:
     if producer is not None:
         if not (producer.endswith(".cti") and Path(producer).is_file()):
             raise InputError(
-                f"{producer} is not a GenTL producer: give the path of a .cti file of your camera's"
-                " software"
+                f"{producer} is not a GenTL producer",
+                "give the path of a .cti file of your camera's software",
             )
         return [str(Path(producer).resolve())]
     folders = [
@@ -83,9 +83,9 @@ def producer_files(producer: str | None = None) -> list[str]:
     if not files:
         raise DeviceError(
             f"no GenTL producer is installed ({PRODUCERS_VARIABLE} names no folder with a .cti"
-            " file): install the software of your camera's maker, such as Spinnaker (FLIR), pylon"
-            " (Basler) or IDS peak, and start again, or give the path of its .cti file as"
-            " `producer`"
+            " file)",
+            "install the software of your camera's maker, such as Spinnaker (FLIR), pylon (Basler)"
+            " or IDS peak, and start again, or give the path of its .cti file as `producer`",
         )
     return list(dict.fromkeys(files))
 
@@ -147,13 +147,14 @@ def _load_producer(file: str) -> Any:
         # harvesters logs why, and goes on without cameras
         if not harvester.has_revised_device_info_list:
             raise DeviceError(
-                f"the GenTL producer {file} cannot list cameras: close other programs that use them"
+                f"the GenTL producer {file} cannot list cameras",
+                "close other programs that use them",
             )
     except BaseException as error:
         ignore_errors(harvester.reset)
         if isinstance(error, (OSError, *_list_library_errors())):
             raise DeviceError(
-                f"the GenTL producer {file} cannot be loaded: install it again ({error})"
+                f"the GenTL producer {file} cannot be loaded", f"install it again ({error})"
             ) from error
         raise
     return harvester
@@ -252,7 +253,7 @@ class Link:
                 ]
                 if not listed:
                     raise DeviceError(
-                        f"{self.name} is not connected: plug it in, and wait until it has started"
+                        f"{self.name} is not connected", "plug it in, and wait until it has started"
                     )
                 # Unused chunks are not parsed: the chunks of a damaged buffer cannot be, which
                 # costs the buffer.
@@ -261,8 +262,8 @@ class Link:
                     self._acquirer = self._harvester.create(listed[0], config=options)
                 if len(self._acquirer.data_streams) != 1:
                     raise DeviceError(
-                        f"{self.name} sends {len(self._acquirer.data_streams)} streams: use one"
-                        " with one"
+                        f"{self.name} sends {len(self._acquirer.data_streams)} streams",
+                        "use one with one",
                     )
                 self._acquirer.timeout_period_on_update_event_data_call = 0
                 self._acquirer.add_callback(
@@ -328,7 +329,7 @@ class Link:
         incomplete one."""
         buffer = self._wait_buffer(timeout_s)
         if buffer is None:
-            raise DeviceError(_describe_incomplete_frame(self.name))
+            raise _report_incomplete_frame(self.name)
         try:
             with as_device_error(self.name):
                 image = self._read_image(buffer, nbytes)
@@ -351,8 +352,8 @@ class Link:
                 return buffer
             if time.monotonic() > until:
                 raise NoFrameError(
-                    f"{self.name} gave no frame within {timeout_s:.1f} s: check its cable, its"
-                    " trigger and its exposure"
+                    f"{self.name} gave no frame within {timeout_s:.1f} s",
+                    "check its cable, its trigger and its exposure",
                 )
             time.sleep(_POLL_S)
 
@@ -370,13 +371,13 @@ class Link:
         )
         if (read_info(buffer, "pixel_format") or self._format) != self._format:
             raise DeviceError(
-                f"{self.name} sends another pixel format than was set: choose another one"
+                f"{self.name} sends another pixel format than was set", "choose another one"
             )
         data = np.frombuffer(buffer.raw_buffer, np.uint8)[offset:]
         needed = nbytes(size, padding)
         filled = read_info(buffer, "size_filled")
         if min(len(data), len(data) if filled is None else filled - offset) < needed:
-            raise DeviceError(_describe_incomplete_frame(self.name))
+            raise _report_incomplete_frame(self.name)
         return Image(data, size, padding)
 
 
@@ -413,9 +414,10 @@ def _return_buffer(buffer: Any) -> None:
     buffer.parent.queue_buffer(buffer)
 
 
-def _describe_incomplete_frame(name: str) -> str:
-    """Return the message for an incomplete frame, with remedies."""
-    return (
-        f"{name} sent an incomplete frame: use a faster port or a shorter cable, and for GigE"
-        " cameras jumbo packets or a longer packet delay"
+def _report_incomplete_frame(name: str) -> DeviceError:
+    """Return the error of an incomplete frame, with remedies."""
+    return DeviceError(
+        f"{name} sent an incomplete frame",
+        "use a faster port or a shorter cable, and for GigE cameras jumbo packets or a longer"
+        " packet delay",
     )

@@ -69,7 +69,7 @@ def _as_device_error(name: str) -> Iterator[None]:
             error.code,
             "switch it off and on, check its cable and battery, and disable its power saving",
         )
-        raise DeviceError(f"{name} does not answer ({error}): {remedy}") from error
+        raise DeviceError(f"{name} does not answer ({error})", remedy) from error
 
 
 def _parse_number(value: object) -> float | None:
@@ -108,7 +108,7 @@ class _Link:
                 continue
             choice = next(filter(fits, self._list_choices(widget)), None)
             if (choice is None or not self._set(widget, choice)) and remedy:
-                raise DeviceError(f"the {what} of {self._name} is {value!r}: {remedy}")
+                raise DeviceError(f"the {what} of {self._name} is {value!r}", remedy)
 
     def read_number(self, names: tuple[str, ...]) -> float | None:
         """Read the number that the first setting of these names has; None without any."""
@@ -125,14 +125,14 @@ class _Link:
         }
         if not choices:
             raise DeviceError(
-                f"{self._name} offers no {what} to be set: turn its dial to M, or set it at the"
-                " camera"
+                f"{self._name} offers no {what} to be set",
+                "turn its dial to M, or set it at the camera",
             )
         nearest = min(choices, key=lambda number: abs(math.log(number / wanted)))
         if not self._set(widget, choices[nearest]):
             raise DeviceError(
-                f"{self._name} refused the {what} {choices[nearest]}: turn its dial to M, or set it"
-                " at the camera"
+                f"{self._name} refused the {what} {choices[nearest]}",
+                "turn its dial to M, or set it at the camera",
             )
 
     def capture(self) -> RawImage:
@@ -154,8 +154,8 @@ class _Link:
                 self._camera.file_delete(*where)
         if PurePath(path.name).suffix.lower() not in RAW_SUFFIXES:
             raise DeviceError(
-                f"{self._name} sent {path.name}, which has a tone curve: set its image quality to"
-                " RAW alone"
+                f"{self._name} sent {path.name}, which has a tone curve",
+                "set its image quality to RAW alone",
             )
         try:
             return develop(data, path.name)
@@ -224,7 +224,7 @@ class DslrCamera(CameraDriver):
         self._first = CameraSettings(self.exposure_ms, self.gain)
         if self.aperture is not None and not 0 < self.aperture < 1000:
             raise InputError(
-                f"an aperture of {self.aperture:g} is impossible: give an f-number, such as 8"
+                f"an aperture of {self.aperture:g} is impossible", "give an f-number, such as 8"
             )
         self._model, self._port = _choose_camera(self.model, self.port)
         super().__init__(f"the camera {self._model}")
@@ -245,8 +245,8 @@ class DslrCamera(CameraDriver):
         if settings.exposure_ms is None or settings.gain is None:
             what = "exposure time" if settings.exposure_ms is None else "ISO"
             raise DeviceError(
-                f"the {what} of {self.name} is automatic: set it at the camera, or in the rig's"
-                " file (exposure_ms, gain)"
+                f"the {what} of {self.name} is automatic",
+                "set it at the camera, or in the rig's file (exposure_ms, gain)",
             )
 
     def _fill(self, out: np.ndarray) -> None:
@@ -259,8 +259,9 @@ class DslrCamera(CameraDriver):
         if (width, height) != self.size:
             _take_first.cache_clear()
             raise DeviceError(
-                f"{self.name} sent a picture of {width}x{height} px, not {self.size[0]}x"
-                f"{self.size[1]}: choose it anew"
+                f"{self.name} sent a picture of {width}x{height} px, not"
+                f" {self.size[0]}x{self.size[1]}",
+                "choose it anew",
             )
         self._focal_mm = image.focal_mm
         return image.rgb

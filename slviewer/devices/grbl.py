@@ -78,12 +78,12 @@ ERRORS = {
 """What the errors of GRBL 1.1 that may happen here mean, and what to do."""
 
 _BLOCKED = {
-    "Hold": "is paused: release the feed hold",
-    "Door": "reports an open safety door: close it",
-    "Check": "is in check mode, in which nothing moves: send $C in a G-code sender",
-    "Sleep": "sleeps: switch it off and on",
+    "Hold": ("is paused", "release the feed hold"),
+    "Door": ("reports an open safety door", "close it"),
+    "Check": ("is in check mode, in which nothing moves", "send $C in a G-code sender"),
+    "Sleep": ("sleeps", "switch it off and on"),
 }
-"""States of GRBL in which it does not turn."""
+"""States of GRBL in which it does not turn, and their remedies."""
 
 
 @dataclass(frozen=True)
@@ -129,12 +129,12 @@ class GcodeTurntable(Openable):
     def __post_init__(self) -> None:
         if self.degrees_per_unit == 0:
             raise InputError(
-                "degrees_per_unit = 0 turns nothing: give the degrees per unit of the axis"
+                "degrees_per_unit = 0 turns nothing", "give the degrees per unit of the axis"
             )
         if (limits := self.limits_deg) is not None:
             if not (len(limits) == 2 and limits[0] < limits[1]):
                 raise InputError(
-                    f"limits_deg = {list(limits)} are not limits: give two, the lower one first"
+                    f"limits_deg = {list(limits)} are not limits", "give two, the lower one first"
                 )
             self.limits_deg = float(limits[0]), float(limits[1])
         super().__init__(f"the turntable at {self.port}")
@@ -159,8 +159,9 @@ class GcodeTurntable(Openable):
             )
         except (OSError, ValueError) as error:
             raise TurntableError(
-                f"{self.name} cannot be opened ({error}): plug it in, end other programs that use"
-                " it, and check the port; `slviewer devices` lists those that are connected"
+                f"{self.name} cannot be opened ({error})",
+                "plug it in, end other programs that use it, and check the port; `slviewer devices`"
+                " lists those that are connected",
             ) from error
         self._claimed.callback(self._serial.close)
         self._buffer, self._unreadable = b"", 0
@@ -202,14 +203,14 @@ class GcodeTurntable(Openable):
                     check()
                     if self._clock() > end:
                         raise TurntableError(
-                            f"{self.name} did not reach {deg:g} degrees in time: {_CHECK_TABLE}"
+                            f"{self.name} did not reach {deg:g} degrees in time", _CHECK_TABLE
                         )
                     time.sleep(self.timing.poll_s)
             reached_deg = self.position_deg()
             if abs(reached_deg - deg) > max(_TOLERANCE_DEG, 0.01 * abs(self.degrees_per_unit)):
                 raise TurntableError(
-                    f"{self.name} stopped at {reached_deg:.2f} instead of {deg:g} degrees:"
-                    f" {_CHECK_TABLE}, and end other programs that use it"
+                    f"{self.name} stopped at {reached_deg:.2f} instead of {deg:g} degrees",
+                    f"{_CHECK_TABLE}, and end other programs that use it",
                 )
         except BaseException:
             self._stop()
@@ -240,12 +241,13 @@ class GcodeTurntable(Openable):
                         break
         if self._unreadable:
             raise TurntableError(
-                f"{self.name} sends unreadable characters at {self.baud} baud: set its own `baud`"
+                f"{self.name} sends unreadable characters at {self.baud} baud", "set its own `baud`"
             )
         raise TurntableError(
             f"{self.name} does not answer as"
             f" {'GRBL or Marlin' if self.dialect == 'auto' else self.dialect} within"
-            f" {self.boot_s:g} s: switch it on, and check `port`, `baud` and `dialect`"
+            f" {self.boot_s:g} s",
+            "switch it on, and check `port`, `baud` and `dialect`",
         )
 
     def _drain(self) -> None:
@@ -270,17 +272,18 @@ class GcodeTurntable(Openable):
                 state, positions = match[1], match[2].split(",")
                 if state == "Alarm":
                     raise TurntableError(
-                        f"{self.name} is locked by an alarm: {_CHECK_TABLE}, {_UNLOCK}"
+                        f"{self.name} is locked by an alarm", f"{_CHECK_TABLE}, {_UNLOCK}"
                     )
                 if state in _BLOCKED:
-                    raise TurntableError(f"{self.name} {_BLOCKED[state]}")
+                    blocked, remedy = _BLOCKED[state]
+                    raise TurntableError(f"{self.name} {blocked}", remedy)
                 index = "XYZABC".find(self.axis)
                 try:
                     return state, float(positions[index] if index >= 0 else "")
                 except (IndexError, ValueError):
                     raise TurntableError(
-                        f"{self.name} has no axis {self.axis}, it has {'XYZABC'[: len(positions)]}:"
-                        " set `axis`"
+                        f"{self.name} has no axis {self.axis}, it has {'XYZABC'[: len(positions)]}",
+                        "set `axis`",
                     ) from None
         raise AssertionError
 
@@ -292,7 +295,7 @@ class GcodeTurntable(Openable):
             position = float(match[1]) if match else position
             if line.startswith("ok"):
                 if position is None:
-                    raise TurntableError(f"{self.name} has no axis {self.axis}: set `axis`")
+                    raise TurntableError(f"{self.name} has no axis {self.axis}", "set `axis`")
                 return position
         raise AssertionError
 
@@ -319,7 +322,7 @@ class GcodeTurntable(Openable):
                 until = self._clock() + self.reply_s
             yield line
         raise TurntableError(
-            f"{self.name} did not {what} in time: switch it off and on, and check its cable"
+            f"{self.name} did not {what} in time", "switch it off and on, and check its cable"
         )
 
     def _check_line(self, line: str, command: str) -> None:
@@ -330,17 +333,17 @@ class GcodeTurntable(Openable):
                 meaning = ALARMS.get(
                     number, f"see the alarms of its firmware; {_CHECK_TABLE}, {_UNLOCK}"
                 )
-                raise TurntableError(f"{self.name} raised alarm {number}: {meaning}")
+                raise TurntableError(f"{self.name} raised alarm {number}", meaning)
             meaning = ERRORS.get(number, "see the errors of its firmware")
-            raise TurntableError(f"{self.name} refused {command!r} with error {number}: {meaning}")
+            raise TurntableError(f"{self.name} refused {command!r} with error {number}", meaning)
         if line.startswith(("Error:", "!!")):
             raise TurntableError(
-                f"{self.name} reports {line!r}: correct that, and switch it off and on"
+                f"{self.name} reports {line!r}", "correct that, and switch it off and on"
             )
         if line.startswith("Grbl ") or line == "start":
             raise TurntableError(
-                f"{self.name} restarted: check its power supply and its cable; its count of the"
-                " angle is lost"
+                f"{self.name} restarted",
+                "check its power supply and its cable; its count of the angle is lost",
             )
 
     def _stop(self) -> None:
@@ -384,7 +387,7 @@ class GcodeTurntable(Openable):
 
     def _describe_loss(self, error: OSError) -> TurntableError:
         """Return the error of a port that is gone."""
-        return TurntableError(f"{self.name} was unplugged ({error}): plug it in again")
+        return TurntableError(f"{self.name} was unplugged ({error})", "plug it in again")
 
 
 def list_serial_ports() -> list[str]:

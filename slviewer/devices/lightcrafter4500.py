@@ -93,15 +93,15 @@ class PatternTiming:
         shortest = MIN_EXPOSURES_US[self.bits - 1]
         if not 1 <= self.count <= self._most or self._least_us < shortest:
             raise InputError(
-                f"per_picture = {self.per_picture} and pattern_us = {self.pattern_us} do not fit:"
-                f" a pattern of {self.bits} bits takes {shortest} us or longer, and a picture at"
-                f" {self.refresh_hz:g} Hz has room for {self._most} of {self._least_us} us"
+                f"per_picture = {self.per_picture} and pattern_us = {self.pattern_us} do not fit",
+                f"a pattern of {self.bits} bits takes {shortest} us or longer, and a picture at"
+                f" {self.refresh_hz:g} Hz has room for {self._most} of {self._least_us} us",
             )
         if self.led_currents == (0, 0, 0):
-            raise InputError("led_currents of 0 give no light: switch one LED on at least")
+            raise InputError("led_currents of 0 give no light", "switch one LED on at least")
         if not all(0 <= register <= _LONGEST_DELAY for register in self._delay_registers):
             raise InputError(
-                f"trigger_delays_us = {self.trigger_delays_us} are impossible: give -20 to 2.7 us"
+                f"trigger_delays_us = {self.trigger_delays_us} are impossible", "give -20 to 2.7 us"
             )
 
     @property
@@ -185,7 +185,7 @@ class PatternTiming:
         for k in range(len(sequence.frames)):
             along, levels = profile(sequence, k)
             if self.bits == 1 and not np.isin(levels, (0, 255)).all():
-                raise InputError("a pattern of one bit has no grey levels: set bits to 7 or 8")
+                raise InputError("a pattern of one bit has no grey levels", "set bits to 7 or 8")
             axis, patterns = groups.pop() if groups else (None, [])
             if len(patterns) == self.count or (axis and along and axis != along):
                 groups.append((axis, patterns))
@@ -216,8 +216,8 @@ class LightCrafter4500(Openable):
         self.size = pictures.size
         if tuple(self.size) != SIZE:
             raise InputError(
-                f"the LightCrafter 4500 has 912x1140 mirrors, and its pictures {self.size} px: give"
-                " it pictures of its size"
+                f"the LightCrafter 4500 has 912x1140 mirrors, and its pictures {self.size} px",
+                "give it pictures of its size",
             )
         self._pictures, self._connect, self._timing = pictures, connect, timing
         self._control: Dlpc350 | None = None
@@ -231,8 +231,9 @@ class LightCrafter4500(Openable):
             transport = self._connect()
         except OSError as error:
             raise DeviceError(
-                f"{self.name} cannot be opened ({error}): close other programs that use it, and on"
-                " Linux permit its USB device by a udev rule"
+                f"{self.name} cannot be opened ({error})",
+                "close other programs that use it, and on Linux permit its USB device by a udev"
+                " rule",
             ) from error
         control = self._control = Dlpc350(transport, self.name)
         self._is_stepping = False
@@ -240,7 +241,7 @@ class LightCrafter4500(Openable):
         control.set(Command.POWER, 0)
         control.write(Command.FREEZE, b"\0")
         if faults := control.list_faults(is_running=False):
-            raise DeviceError(f"{self.name} {'; it '.join(faults)}")
+            raise control.describe_faults(faults)
         control.write(Command.SOURCE, bytes([_PARALLEL_24_BIT]))
         if (currents := self._timing.led_currents) is not None:
             # the board's drivers give most current at 0

@@ -205,16 +205,16 @@ def connect_source(
         )
         if not capture.isOpened():
             raise DeviceError(
-                f"{name} does not answer, or not with a video: check that its camera is switched"
-                " on, and its address"
+                f"{name} does not answer, or not with a video",
+                "check that its camera is switched on, and its address",
             )
         return Connected(capture, live=capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0)
     if not Path(source).is_file():
-        raise DeviceError(f"{name} does not exist: check its path, {source}")
+        raise DeviceError(f"{name} does not exist", f"check its path, {source}")
     capture = cv2.VideoCapture(source)
     if not capture.isOpened():
         raise DeviceError(
-            f"{name} cannot be read as a video: convert it, to MJPEG in an AVI file for instance"
+            f"{name} cannot be read as a video", "convert it, to MJPEG in an AVI file for instance"
         )
     return Connected(capture, live=False)
 
@@ -261,8 +261,8 @@ def _open_webcam(source: int | str, size: tuple[int, int] | None) -> Connected:
             break
     else:
         raise DeviceError(
-            f"{describe_source(source)} does not answer: check its cable, whether another program"
-            " uses it, and what `slviewer devices` finds"
+            f"{describe_source(source)} does not answer",
+            "check its cable, whether another program uses it, and what `slviewer devices` finds",
         )
     if size is not None and not _set_size(capture, size):
         # many webcams have their larger sizes compressed only, and OpenCV tries that last
@@ -342,7 +342,7 @@ class OpenCVCamera(CameraDriver):
             for value in (self.gain, self.focus, self.white_balance)
         ):
             raise InputError(
-                "a gain, a focus or a white balance that is not a number cannot be set: give one"
+                "a gain, a focus or a white balance that is not a number cannot be set", "give one"
             )
         super().__init__(describe_source(source))
         if wanted is None and source in _IN_USE:
@@ -468,8 +468,8 @@ class OpenCVCamera(CameraDriver):
             read, following = reader.do(lambda capture: capture.read())
             if not read:
                 raise DeviceError(
-                    f"{self.name} has ended after {self._read} pictures: close it and open it again"
-                    " to start over"
+                    f"{self.name} has ended after {self._read} pictures",
+                    "close it and open it again to start over",
                 )
         self._read += 1
         return self._check_size(following)
@@ -481,11 +481,12 @@ class OpenCVCamera(CameraDriver):
         if (width, height) != self.size:
             raise DeviceError(
                 f"{self.name} gives pictures of {width} x {height} px instead of {self.size[0]} x"
-                f" {self.size[1]}: choose {width} x {height} as its size, or another that it has"
+                f" {self.size[1]}",
+                f"choose {width} x {height} as its size, or another that it has",
             )
         if image.dtype != np.uint8:
             raise DeviceError(
-                f"{self.name} gives {image.dtype} and not 8 bits: switch it to an 8-bit format"
+                f"{self.name} gives {image.dtype} and not 8 bits", "switch it to an 8-bit format"
             )
         return image
 
@@ -500,7 +501,7 @@ def _check_source(source: int | str) -> int | str:
         or (isinstance(source, int) and source < 0)
     ):
         raise InputError(
-            f"{source!r} is not a camera: give a webcam's number, a video file, or an address"
+            f"{source!r} is not a camera", "give a webcam's number, a video file, or an address"
         )
     return source
 

@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -121,7 +122,7 @@ class Reader:
         self._wanted: _Wanted | None = None
         self._first: np.ndarray | None = None
         self._arrived = timing.clock()
-        self._lost = ""
+        self._lost: DeviceError | None = None
         self._closing = False
         self._live = False
         self._pace = Pace()
@@ -190,18 +191,19 @@ class Reader:
         requested_s = self._timing.clock()
         while not ready():
             if self._lost:
-                raise DeviceError(self._lost)
+                raise copy(self._lost)
             now = self._timing.clock()
             silent = now - max(self._arrived, requested_s) if longest_s else now - requested_s
             if silent > patience_s:
                 raise DeviceError(
-                    f"{self._name} gave no picture within {patience_s:g} s: check its cable and"
-                    " whether another program uses it"
+                    f"{self._name} gave no picture within {patience_s:g} s",
+                    "check its cable and whether another program uses it",
                 )
             if longest_s and now - requested_s > longest_s:
                 raise DeviceError(
                     f"the pictures of {self._name} arrive too irregularly to separate new from"
-                    " buffered ones: use a cable instead of a radio link, or a lower frame rate"
+                    " buffered ones",
+                    "use a cable instead of a radio link, or a lower frame rate",
                 )
             self._condition.wait(0.1)
 
@@ -232,9 +234,11 @@ class Reader:
                 if connected.live and not self._closing:
                     self._read_next(connected)
         except DeviceError as error:
-            self._report_loss(str(error))
+            self._report_loss(error)
         except Exception as error:
-            self._report_loss(f"{self._name} failed ({error}): close it and open it again")
+            self._report_loss(
+                DeviceError(f"{self._name} failed ({error})", "close it and open it again")
+            )
         finally:
             if capture is not None:
                 capture.release()
@@ -258,8 +262,8 @@ class Reader:
             frames += read
         if not read:
             raise DeviceError(
-                f"{self._name} was detected and gives no picture: check whether another program"
-                " uses it, or choose another size"
+                f"{self._name} was detected and gives no picture",
+                "check whether another program uses it, or choose another size",
             )
         with self._condition:
             self._first, self._live, self._arrived = image, connected.live, timing.clock()
@@ -276,8 +280,8 @@ class Reader:
         if not read:
             if now - self._arrived > self._timing.ended_s:
                 raise DeviceError(
-                    f"{self._name} gives no more pictures: plug it in or start it again, and"
-                    " reconnect"
+                    f"{self._name} gives no more pictures",
+                    "plug it in or start it again, and reconnect",
                 )
             time.sleep(0.01)
             return
@@ -297,7 +301,8 @@ class Reader:
         if self._pace.saturated:
             raise DeviceError(
                 f"{self._name} sends pictures faster than this computer can unpack them, so that"
-                " they grow old: lower their size or their rate"
+                " they grow old",
+                "lower their size or their rate",
             )
         if image is None:
             read, image = connected.capture.retrieve()
@@ -306,7 +311,7 @@ class Reader:
                 wanted.image = image
                 self._condition.notify_all()
 
-    def _report_loss(self, why: str) -> None:
+    def _report_loss(self, why: DeviceError) -> None:
         """Store why the source was lost, and wake those that wait."""
         with self._condition:
             self._lost = why

@@ -121,14 +121,15 @@ class PageConnection(Generic[Facts]):
                 remaining_s = end - time.monotonic()
                 if remaining_s <= 0:
                     raise DeviceError(
-                        f"{self.name} did not answer within {timeout_s:g} s: look whether its"
-                        " window is covered, its computer asleep, or the network down"
+                        f"{self.name} did not answer within {timeout_s:g} s",
+                        "look whether its window is covered, its computer asleep, or the network"
+                        " down",
                     )
                 self.condition.wait(remaining_s)
             done, content = self.answer
             self.answer = None
             if done.why:
-                raise DeviceError(f"{self.name} failed, {done.why}: reload it")
+                raise DeviceError(f"{self.name} failed, {done.why}", "reload it")
             return content
 
     def check(self) -> None:
@@ -192,7 +193,7 @@ class PageChannel(ABC, Generic[Facts]):
         with self._condition:
             if self._page is None:
                 raise DeviceError(
-                    f"no {self.name.removeprefix('the ')} is connected: {self.remedy}"
+                    f"no {self.name.removeprefix('the ')} is connected", f"{self.remedy}"
                 )
             self._page.check()
             return self._page
@@ -267,7 +268,9 @@ class PageChannel(ABC, Generic[Facts]):
         try:
             return msgspec.json.decode(message, type=kind)
         except (msgspec.MsgspecError, UnicodeError) as error:
-            raise InputError(f"{self.name} sent an invalid message ({error}): reload it") from error
+            raise InputError(
+                f"{self.name} sent an invalid message ({error})", "reload it"
+            ) from error
 
 
 Channel = TypeVar("Channel", bound=PageChannel[Any])
@@ -293,12 +296,12 @@ class PageDevice(Openable, Generic[Channel]):
         super().__init__(f"the browser {what}")
         if page is None:
             raise DeviceError(
-                f"{self.name}'s page is served by `slviewer wizard` and `slviewer capture`: use one"
-                " of them"
+                f"{self.name}'s page is served by `slviewer wizard` and `slviewer capture`",
+                "use one of them",
             )
         known = page.page_state().size if size is None else check_image_size(what, size, most_px)
         if known is None:
             raise DeviceError(
-                f"the {what}'s size is unknown: open the {what} page first, or give the size"
+                f"the {what}'s size is unknown", f"open the {what} page first, or give the size"
             )
         self._pages, self.size = page, known

@@ -46,7 +46,7 @@ def _as_device_error(name: str) -> Iterator[None]:
         yield
     except (ImportError, RuntimeError, OSError) as error:  # TimeoutError is an OSError
         reason = str(error) or type(error).__name__
-        raise DeviceError(f"{name} does not answer ({reason}): {_CHECK}") from error
+        raise DeviceError(f"{name} does not answer ({reason})", _CHECK) from error
 
 
 def _open_camera(number: int, size: tuple[int, int] | None) -> tuple[Any, dict[str, Any]]:
@@ -69,8 +69,8 @@ def _open_camera(number: int, size: tuple[int, int] | None) -> tuple[Any, dict[s
         raw = camera.camera_configuration()["raw"]
         if raw is None:
             raise InputError(
-                f"the camera {number} is not a camera module, and has no raw stream: use the driver"
-                " opencv"
+                f"the camera {number} is not a camera module, and has no raw stream",
+                "use the driver opencv",
             )
     except BaseException:
         camera.close()
@@ -123,13 +123,14 @@ class PiCamera(CameraDriver):
         pixels = _parse_format(self._format)
         if pixels is None:
             raise InputError(
-                f"{self.name} sends {self._format}, which cannot be read: update picamera2"
+                f"{self.name} sends {self._format}, which cannot be read", "update picamera2"
             )
         if self._wanted not in (None, self.size):
             (width, height), (columns, rows) = self._wanted, self.size
             raise InputError(
-                f"{self.name} has no mode of {width}x{height} px: choose [{columns}, {rows}] as"
-                " `size`, which is the nearest, or another of its modes"
+                f"{self.name} has no mode of {width}x{height} px",
+                f"choose [{columns}, {rows}] as `size`, which is the nearest, or another of its"
+                " modes",
             )
         self.pixels = pixels
         self.dtype = pixels.dtype
@@ -148,7 +149,7 @@ class PiCamera(CameraDriver):
             self._claimed.callback(self._camera.close)
             if (tuple(raw["size"]), raw["format"]) != (self.size, self._format):
                 _describe_stream.cache_clear()
-                raise DeviceError(f"{self.name} is another one than before: choose it anew")
+                raise DeviceError(f"{self.name} is another one than before", "choose it anew")
             self._padding = raw["stride"] - self.pixels.nbytes((self.size[0], 1))
             self._set(_FIXED | ({} if self.focus is None else {"LensPosition": self.focus}))
             self._camera.start()
@@ -179,8 +180,8 @@ class PiCamera(CameraDriver):
                         request.make_buffer("raw"), self.size, self._padding
                     )
         raise DeviceError(
-            f"{self.name} sent {_MOST_FRAMES} frames that began before the pattern was shown:"
-            " close and open it again"
+            f"{self.name} sent {_MOST_FRAMES} frames that began before the pattern was shown",
+            "close and open it again",
         )
 
     @contextlib.contextmanager
@@ -193,7 +194,7 @@ class PiCamera(CameraDriver):
                 request = job.get_result(timeout=_ANSWER_S + 4 * exposure_s)
             except TimeoutError as error:
                 self._camera.cancel_all_and_flush()  # or it could not be closed
-                raise DeviceError(f"{self.name} sends no frames: {_CHECK}") from error
+                raise DeviceError(f"{self.name} sends no frames", _CHECK) from error
             try:
                 self._metadata = request.get_metadata()
                 yield request

@@ -102,7 +102,7 @@ class PixelFormat:
             return samples[..., 2::-1] if self.kind.startswith("BGR") else samples[..., :3]
         if self.kind in _DEMOSAIC:
             return cv2.cvtColor(samples, _DEMOSAIC[self.kind])
-        raise InputError(f"{self.name} tells no colours: choose a colour format")
+        raise InputError(f"{self.name} tells no colours", "choose a colour format")
 
 
 def pixel_format(name: str) -> PixelFormat | None:

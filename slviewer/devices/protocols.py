@@ -30,12 +30,12 @@ class CameraSettings:
     def __post_init__(self) -> None:
         if self.exposure_ms is not None and not 0 < self.exposure_ms <= 600_000:
             raise InputError(
-                f"an exposure of {self.exposure_ms:g} ms is impossible: give one above 0, up to"
-                " 600,000"
+                f"an exposure of {self.exposure_ms:g} ms is impossible",
+                "give one above 0, up to 600,000",
             )
         if self.gain is not None and not 0 < self.gain <= 1e6:
             raise InputError(
-                f"a gain of {self.gain:g} is impossible: give a factor above 0, 1 for none"
+                f"a gain of {self.gain:g} is impossible", "give a factor above 0, 1 for none"
             )
 
 
@@ -152,7 +152,7 @@ def check_channel(channel: str) -> None:
     """Raise InputError unless `channel` is one of `Channel`."""
     if channel not in get_args(Channel):
         raise InputError(
-            f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}"
+            f"no channel is called {channel!r}", f"use one of {', '.join(get_args(Channel))}"
         )
 
 
@@ -161,8 +161,8 @@ def check_image_size(what: str, size: Sequence[int], most_px: int = 2**16) -> tu
     anything else."""
     if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= most_px for side in size):
         raise InputError(
-            f"{size!r} is not the size of a {what}: give its width and height in px, such as [1280,"
-            " 720]"
+            f"{size!r} is not the size of a {what}",
+            "give its width and height in px, such as [1280, 720]",
         )
     return size[0], size[1]
 
@@ -300,7 +300,7 @@ class Openable:
         """Open the device. Raises DeviceError if it is open already, or does not start; it is
         closed then."""
         if self._open:
-            raise DeviceError(f"{self.name} is open already: close it first")
+            raise DeviceError(f"{self.name} is open already", "close it first")
         self._open = True
         try:
             self._start()
@@ -320,7 +320,7 @@ class Openable:
     def check_open(self) -> None:
         """Raise DeviceError unless it is open."""
         if not self._open:
-            raise DeviceError(f"{self.name} is not open: open it before using it")
+            raise DeviceError(f"{self.name} is not open", "open it before using it")
 
 
 @dataclass(frozen=True)
@@ -394,11 +394,12 @@ def check_frame(camera: Camera, out: np.ndarray) -> None:
     if out.shape != (height, width) or out.dtype != camera.dtype:
         raise InputError(
             f"{camera.name} fills frames of shape {(height, width)} {camera.dtype}, got {out.shape}"
-            f" {out.dtype}: make the array by its size"
+            f" {out.dtype}",
+            "make the array by its size",
         )
     if not (out.flags.c_contiguous and out.flags.writeable):
         raise InputError(
-            f"{camera.name} fills frames row by row: give a contiguous array that can be written"
+            f"{camera.name} fills frames row by row", "give a contiguous array that can be written"
         )
 
 
@@ -456,24 +457,27 @@ def choose_only(cameras: Sequence[Listed], fits: Callable[[Listed], bool], key: 
     if len(matching) == 1:
         return matching[0]
     if matching:
-        raise InputError(f"{len(matching)} cameras match ({listed}): choose one by its {key}")
+        raise InputError(f"{len(matching)} cameras match ({listed})", f"choose one by its {key}")
+    if cameras:
+        raise DeviceError(
+            f"no such camera is connected, only {listed}", "choose one of them, or plug yours in"
+        )
     raise DeviceError(
-        f"no such camera is connected, only {listed}: choose one of them, or plug yours in"
-        if cameras
-        else "no camera is connected: plug one in, wait until it has started, disable its power"
-        " saving, and close other programs"
+        "no camera is connected",
+        "plug one in, wait until it has started, disable its power saving, and close other"
+        " programs",
     )
 
 
 def check_sequence(projector: Projector, sequence: PatternSequence) -> None:
     """Raise InputError unless `sequence` has frames, and the projector's size."""
     if not sequence.frames:
-        raise InputError("the pattern sequence has no frames: choose one that has")
+        raise InputError("the pattern sequence has no frames", "choose one that has")
     if tuple(sequence.projector) != tuple(projector.size):
         (w, h), (columns, rows) = sequence.projector, projector.size
         raise InputError(
-            f"the patterns are {w}x{h} px and {projector.name} has {columns}x{rows}: make them for"
-            " this projector"
+            f"the patterns are {w}x{h} px and {projector.name} has {columns}x{rows}",
+            "make them for this projector",
         )
 
 
@@ -482,8 +486,8 @@ def check_angle(turntable: Turntable, deg: float) -> None:
     low, high = turntable.limits_deg or (-_MAX_ANGLE_DEG, _MAX_ANGLE_DEG)
     if not low <= deg <= high:
         raise InputError(
-            f"{turntable.name} turns from {low:g} to {high:g} degrees, not to {deg:g}: choose"
-            " others"
+            f"{turntable.name} turns from {low:g} to {high:g} degrees, not to {deg:g}",
+            "choose others",
         )
 
 
@@ -494,10 +498,10 @@ def check_index(
     else InputError."""
     if sequence is None:
         raise DeviceError(
-            f"{projector.name} has no patterns: load a sequence before showing a frame"
+            f"{projector.name} has no patterns", "load a sequence before showing a frame"
         )
     if not 0 <= index < len(sequence.frames):
-        raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
+        raise InputError(f"frame {index} of {len(sequence.frames)} does not exist", "count from 0")
     return sequence
 
 
@@ -507,6 +511,6 @@ def check_level(grey: int | None) -> int:
         return 0
     if not 0 <= grey <= 255:
         raise InputError(
-            f"a grey level of {grey} cannot be projected: give 0 to 255, or None for dark"
+            f"a grey level of {grey} cannot be projected", "give 0 to 255, or None for dark"
         )
     return grey

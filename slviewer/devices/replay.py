@@ -39,8 +39,8 @@ class Recording:
         ):
             raise InputError(
                 f"the recording holds frames of {before.shape[1:]} {before.dtype} for a projector"
-                f" of {projector}, got {frames.shape[1:]} {frames.dtype} and {sequence.projector}:"
-                " replay captures of one rig together"
+                f" of {projector}, got {frames.shape[1:]} {frames.dtype} and {sequence.projector}",
+                "replay captures of one rig together",
             )
         self.played = (frames, sequence)
 
@@ -63,7 +63,7 @@ class ReplayCamera(CameraDriver):
         """Copy the recorded frame of the pattern shown; under even light of any level, the recorded
         texture."""
         if self._recording.visible_frame is None:
-            raise DeviceError("the recording holds no dark frame: show a pattern or light")
+            raise DeviceError("the recording holds no dark frame", "show a pattern or light")
         out[:] = self._recording.visible_frame
 
 
@@ -89,7 +89,8 @@ class ReplayProjector(Openable):
             raise DeviceError(
                 "the recording answers only to the patterns it was made with,"
                 f" {_describe_sequence(played[1])}, and was asked for"
-                f" {_describe_sequence(sequence)}: capture with its own sequence"
+                f" {_describe_sequence(sequence)}",
+                "capture with its own sequence",
             )
         self._loaded = played
 
@@ -139,7 +140,8 @@ def _check_recording(frames: np.ndarray, sequence: PatternSequence) -> None:
     ):
         raise InputError(
             f"{len(sequence.frames)} frames (n, h, w) of uint8 or uint16 are needed for this"
-            f" sequence, got {frames.shape} {frames.dtype}: give one image a pattern"
+            f" sequence, got {frames.shape} {frames.dtype}",
+            "give one image a pattern",
         )
 
 

@@ -181,7 +181,7 @@ def preset_rig(
     """Return a preset's rig with a board, such as "circles:21x16:9"; `scale` multiplies the
     camera's size."""
     if preset != "letter":
-        raise InputError(f"no rig preset is called {preset!r}: use letter")
+        raise InputError(f"no rig preset is called {preset!r}", "use letter")
     return simulated_rig(SimulatedWorld(letter(scale, seed), Board.parse(board)))
 
 

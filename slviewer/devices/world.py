@@ -153,11 +153,11 @@ class SimulatedWorld:
         pose."""
         if thing not in get_args(Thing):
             raise InputError(
-                f"the simulated world has no {thing!r}: use one of {', '.join(get_args(Thing))}"
+                f"the simulated world has no {thing!r}", f"use one of {', '.join(get_args(Thing))}"
             )
         if pose is not None and not (np.isfinite(pose.R).all() and np.isfinite(pose.t).all()):
             raise InputError(
-                "a pose with numbers that are not finite places nothing: give a turn and mm"
+                "a pose with numbers that are not finite places nothing", "give a turn and mm"
             )
         with self._lock:
             scene = self._things[thing] if thing in self._things else _make_scene(thing)

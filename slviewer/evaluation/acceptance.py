@@ -182,7 +182,7 @@ class Artefact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         try:
             return from_plain(given, cls)
         except InputError as error:
-            place, _, reason = str(error).partition(": ")
+            place = error.place
             table, _, key = place.partition(".")
             entries = given.get(table)
             if isinstance(entries, Mapping):
@@ -191,7 +191,9 @@ class Artefact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             remedy = f"use {', '.join(known)}"
             if entries is not None and table != "kind":
                 remedy = f"{entries!r} is impossible: check unit and sign"
-            raise InputError(f"the artefact's file: {place.strip()}: {reason}; {remedy}") from error
+            raise InputError(
+                f"{error.observation}; {remedy}", place=f"the artefact's file: {place.strip()}"
+            ) from error
 
 
 _TABLES: dict[str, type[msgspec.Struct]] = {

@@ -173,9 +173,8 @@ def _judge_coordinates(evaluator: Evaluator, base: Hypothesis) -> Iterator[Findi
             if layout.shifts and not layout.numbers_periods:
                 layout_levels(layout)
         except InputError as error:
-            text, _, remedy = str(error).removeprefix(f"axis {axis}: ").partition(": ")
-            remedy = remedy or REMEDIES["projector-size"]
-            yield Finding("projector-size", "rejected", text, remedy, (), (), axis)
+            remedy = error.remedy or REMEDIES["projector-size"]
+            yield Finding("projector-size", "rejected", error.observation, remedy, (), (), axis)
             continue
         if axis in beyond:
             yield describe_reach(axis, sequence.extent(axis), *beyond[axis])

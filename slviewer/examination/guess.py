@@ -105,8 +105,8 @@ def guess_sequence(stack: np.ndarray, projector: Size | None = None) -> Guess:
     """
     if stack.ndim != 3 or len(stack) < 3:
         raise InputError(
-            f"a stack of shape {stack.shape} is not a capture: give three or more images of one"
-            " size"
+            f"a stack of shape {stack.shape} is not a capture",
+            "give three or more images of one size",
         )
     reader = BlockReader(sample_lines(stack))
     everything = tuple(range(len(stack)))

@@ -34,8 +34,8 @@ def merge_exposures(
     shapes = {(np.shape(stack), np.asarray(stack).dtype.str) for stack in stacks}
     if len(shapes) != 1 or len(stacks) != len(exposures) or stacks[0].ndim != 3:
         raise InputError(
-            f"{len(exposures)} exposures and stacks of {sorted(shapes)}: give each one (n, h, w),"
-            " all alike"
+            f"{len(exposures)} exposures and stacks of {sorted(shapes)}",
+            "give each one (n, h, w), all alike",
         )
     choice = choose_exposure(np.stack([peaks(stack) for stack in stacks]), exposures, full_scale)
     frames, masks = np.empty_like(stacks[0], order="C"), chosen(choice, len(exposures))
@@ -51,7 +51,7 @@ def peaks(frames: Iterable[np.ndarray]) -> np.ndarray:
     for frame in frames:
         largest = frame.copy() if largest is None else np.maximum(largest, frame, out=largest)
     if largest is None:
-        raise InputError("an exposure without frames has no peaks: give one frame or more")
+        raise InputError("an exposure without frames has no peaks", "give one frame or more")
     return largest
 
 
@@ -62,11 +62,11 @@ def choose_exposure(
     each of them."""
     if len(highest) != len(exposures) or not 0 < len(exposures) < 256 or min(exposures) <= 0:
         raise InputError(
-            f"peaks of {len(highest)} stacks and exposures of {list(exposures)}: give one time"
-            " above 0 each"
+            f"peaks of {len(highest)} stacks and exposures of {list(exposures)}",
+            "give one time above 0 each",
         )
     if len(set(exposures)) < len(exposures):
-        raise InputError(f"exposures of {', '.join(f'{e:g}' for e in exposures)}: give each once")
+        raise InputError(f"exposures of {', '.join(f'{e:g}' for e in exposures)}", "give each once")
     white = clip_level(highest.dtype, int(highest.max()), full_scale)
     order = np.argsort(exposures)
     choice = np.full(highest.shape[1:], order[0], np.uint8)

@@ -99,7 +99,7 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
             if sequence.axes
             else "phase steps or Gray bits are needed"
         )
-        raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
+        raise InputError(f"no frame carries a pattern along axis {axis}", there)
     shifts = tuple(Shift(*shift) for shift in sequence.phase_shifts(axis))
     complementary, white, black = (
         next(iter(sequence.find(kind, axis)), None) for kind in ("complementary", "white", "black")
@@ -121,8 +121,9 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
     )
     if not (shifts or layout.inverse or None not in (white, black)):
         raise InputError(
-            f"axis {axis}: Gray code alone needs its inverses, or a white and a black frame: add"
-            " them"
+            "Gray code alone needs its inverses, or a white and a black frame",
+            "add them",
+            f"axis {axis}",
         )
     if layout.gray or complementary is not None:
         _check_code(layout)
@@ -135,18 +136,18 @@ def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
     if not isinstance(stack, np.ndarray):
         sizes = sorted({np.shape(frame) for frame in stack})
         raise InputError(
-            f"the frames are not one array (their shapes: {sizes}): stack frames of one size"
+            f"the frames are not one array (their shapes: {sizes})", "stack frames of one size"
         )
     if stack.ndim != 3 or 0 in stack.shape:
         raise InputError(
-            f"the stack has shape {stack.shape}: give (frames, rows, columns), one channel"
+            f"the stack has shape {stack.shape}", "give (frames, rows, columns), one channel"
         )
     if stack.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"the frames hold {stack.dtype} values: give uint8 or uint16")
+        raise InputError(f"the frames hold {stack.dtype} values", "give uint8 or uint16")
     if len(stack) != len(sequence.frames):
         raise InputError(
-            f"{len(stack)} frames for a sequence of {len(sequence.frames)}: give one image for each"
-            " frame"
+            f"{len(stack)} frames for a sequence of {len(sequence.frames)}",
+            "give one image for each frame",
         )
 
 
@@ -165,8 +166,9 @@ def white_level(sequence: PatternSequence, stack: np.ndarray, indices: Sequence[
     if stated is not None and not largest <= stated <= np.iinfo(stack.dtype).max:
         raise InputError(
             f"full_scale is stated as {stated}, and the frames are {stack.dtype} and reach"
-            f" {largest}: correct it in the description of the images or in the driver of the"
-            " camera, then import or capture again"
+            f" {largest}",
+            "correct it in the description of the images or in the driver of the camera, then"
+            " import or capture again",
         )
     full_scale = clip_level(stack.dtype, largest, stated)
     steps = sample_phase_steps(sequence, stack)
@@ -241,14 +243,16 @@ def _check_code(layout: Layout) -> None:
     """Raise InputError where the Gray bits cannot number the whole axis."""
     where = f"axis {layout.axis}"
     if not layout.gray:
-        raise InputError(f"{where}: a complementary bit without Gray bits says nothing: add them")
+        raise InputError("a complementary bit without Gray bits says nothing", "add them", where)
     if layout.extent == np.inf:
         return
     cells = (layout.extent - 0.5 - layout.gray_origin_px) / layout.gray_cell_px
     if 2 ** len(layout.gray) < cells - 0.5:
         what = "periods" if layout.numbers_periods else f"cells of {layout.gray_cell_px:g} px"
         raise InputError(
-            f"{where}: {len(layout.gray)} Gray bits number {2 ** len(layout.gray)} {what}, and"
-            f" {layout.extent:g} px hold {cells:.0f}: give the fringe period, gray_cell_px and the"
-            " size of the projector that were used, or the missing bits"
+            f"{len(layout.gray)} Gray bits number {2 ** len(layout.gray)} {what}, and"
+            f" {layout.extent:g} px hold {cells:.0f}",
+            "give the fringe period, gray_cell_px and the size of the projector that were used, or"
+            " the missing bits",
+            where,
         )

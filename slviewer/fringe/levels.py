@@ -41,7 +41,7 @@ def layout_levels(layout: Layout) -> tuple[Level, ...]:
     InputError where the periods do not cover what they must: a Gray cell, the projector, or, where
     a relative phase is acceptable, a range of whole periods.
     """
-    periods, where = tuple(shift.period_px for shift in layout.shifts), f"axis {layout.axis}: "
+    periods, where = tuple(shift.period_px for shift in layout.shifts), f"axis {layout.axis}"
     if layout.gray:
         cell = code_cell_px(layout)
         try:
@@ -50,16 +50,20 @@ def layout_levels(layout: Layout) -> tuple[Level, ...]:
             if cell <= WIDEST_CELL * periods[0]:
                 return plan_levels(periods, periods[0])
             raise InputError(
-                f"{where}{error}, which a Gray cell spans: set gray_cell_px if the cells are"
-                f" narrower, or add Gray bits or the steps of a period of {cell:g} px or more"
+                f"{error}, which a Gray cell spans",
+                "set gray_cell_px if the cells are narrower, or add Gray bits or the steps of a"
+                f" period of {cell:g} px or more",
+                where,
             ) from error
     try:
         return plan_levels(periods, layout.extent)
     except InputError as error:
         if not layout.relative:
             raise InputError(
-                f"{where}{error}, which the projector spans: add a longer period or Gray code, or"
-                " set relative = true for a phase that is not absolute"
+                f"{error}, which the projector spans",
+                "add a longer period or Gray code, or set relative = true for a phase that is not"
+                " absolute",
+                where,
             ) from error
     return plan_levels(periods, find_common_range(periods))
 
@@ -173,8 +177,9 @@ def find_common_range(periods_px: tuple[float, ...]) -> float:
             return float(reach)
     raise InputError(
         f"fringe periods of {_join_periods(periods_px)} px share no range of which each is a whole"
-        " part, so that even a relative phase cannot be decoded: give the size of a projector that"
-        f" the longest covers, or leave out the steps of all but {periods_px[-1]:g} px"
+        " part, so that even a relative phase cannot be decoded",
+        "give the size of a projector that the longest covers, or leave out the steps of all but"
+        f" {periods_px[-1]:g} px",
     )
 
 

@@ -39,7 +39,7 @@ def mask_motion(
     finest = np.array(shifts[-1].indices, np.int64)
     if len(finest) % 2:
         raise InputError(
-            f"{len(finest)} steps of the finest period do not reveal motion: use an even number"
+            f"{len(finest)} steps of the finest period do not reveal motion", "use an even number"
         )
     begins = np.cumsum([0, *(len(shift.indices) for shift in shifts)])
     indices = np.concatenate([np.array(shift.indices, np.int64) for shift in shifts])

@@ -64,8 +64,8 @@ def estimate_gray_origin(
         sequence, stack, _ = equalize_frames(sequence, stack, light)
     if not (layout.shifts and layout.gray):
         raise InputError(
-            f"axis {axis}: the origin of a Gray code shows only beside a phase shift: there is none"
-            " to compare"
+            f"axis {axis}: the origin of a Gray code shows only beside a phase shift",
+            "there is none to compare",
         )
     white = white_level(sequence, stack, sequence.select(axis))
     found = measure_code_origin(layout, stack, white)
@@ -79,13 +79,13 @@ def estimate_gray_origin(
         is_sign = measure_code_origin(other, stack, white).rising >= 1 - MIN_RISING
         sign = f"set phase_sign to {other.sign}, or " if is_sign else ""
         raise InputError(
-            f"axis {axis}: the code falls where the phase rises: {sign}correct the order of the"
-            " steps"
+            f"axis {axis}: the code falls where the phase rises",
+            f"{sign}correct the order of the steps",
         )
     if not np.isfinite(found.turns):
         raise InputError(
-            f"axis {axis}: the code edges fall at no common phase: check the period, the order of"
-            " the bits, and which frames belong together"
+            f"axis {axis}: the code edges fall at no common phase",
+            "check the period, the order of the bits, and which frames belong together",
         )
     turns = found.turns - np.ceil(found.turns - LATEST_TURNS)
     return float(turns * layout.period_px)

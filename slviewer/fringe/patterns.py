@@ -21,7 +21,7 @@ def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndar
     bits are 0 or 255. Where the sequence has a table of `levels`, it is applied to the cosines.
     """
     if not 0 <= index < len(sequence.frames):
-        raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
+        raise InputError(f"frame {index} of {len(sequence.frames)} does not exist", "count from 0")
     frame = sequence.frames[index]
     if frame.axis is None or frame.kind in ("white", "black", "texture"):
         return None, np.full(sequence.projector[0], 0 if frame.kind == "black" else 255, np.uint8)
@@ -50,8 +50,9 @@ def _compute_gray_bit(sequence: PatternSequence, axis: Axis, frame: Frame) -> np
     code = np.floor((2 if half else 1) * u / cell + 1e-9).astype(np.int64)
     if code.min() < 0 or code.max() >= 1 << (bits + half):
         raise InputError(
-            f"{bits} Gray bits cannot number {sequence.extent(axis)} px from {origin:g} px on "
-            f"in cells of {cell:g} px: use more bits, or the origin -0.5"
+            f"{bits} Gray bits cannot number {sequence.extent(axis)} px from {origin:g} px on in"
+            f" cells of {cell:g} px",
+            "use more bits, or the origin -0.5",
         )
     gray = code ^ (code >> 1)
     bit = (gray >> (0 if half else bits - 1 - frame.bit)) & 1

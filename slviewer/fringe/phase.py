@@ -83,8 +83,8 @@ class PhaseMap:
         maps = (self.phase, self.wrapped, self.modulation, self.background, self.reason)
         if any(m.ndim != 2 or m.shape != self.phase.shape for m in maps):
             raise InputError(
-                f"the maps of a phase map have shapes {[m.shape for m in maps]}: they must all be"
-                " one (h, w)"
+                f"the maps of a phase map have shapes {[m.shape for m in maps]}",
+                "they must all be one (h, w)",
             )
 
     @property

@@ -62,7 +62,7 @@ def multifrequency(
     for axis, extent in zip(AXES, projector, strict=True):
         periods = list(periods_px) if periods_px is not None else covering_periods(extent)
         if len(set(periods)) != len(periods) or not periods:
-            raise InputError(f"periods of {periods} px: give one or more, each once")
+            raise InputError(f"periods of {periods} px", "give one or more, each once")
         for period in sorted(periods, reverse=True):
             frames += phase_steps(axis, steps, period)
     return PatternSequence(projector, (*frames, Frame("texture")))
@@ -117,7 +117,7 @@ PRESETS: dict[str, Callable[[Size], PatternSequence]] = {
 def find_preset(name: str) -> Callable[[Size], PatternSequence]:
     """Return the preset of that name. Raises InputError where there is none."""
     if name not in PRESETS:
-        raise InputError(f"no pattern sequence is called {name!r}: use {', '.join(PRESETS)}")
+        raise InputError(f"no pattern sequence is called {name!r}", f"use {', '.join(PRESETS)}")
     return PRESETS[name]
 
 

@@ -30,8 +30,8 @@ def develop(data: bytes, name: str, most_pixels: int = 2**28) -> RawImage:
     image is not rotated. Raises InputError where it cannot be read, or rawpy is missing."""
     if find_spec("rawpy") is None:
         raise InputError(
-            f"{name} is a RAW file, and the package rawpy, which reads it, is missing: pip install"
-            " 'slviewer[raw]', or convert it to a TIFF of 16 bits without a tone curve"
+            f"{name} is a RAW file, and the package rawpy, which reads it, is missing",
+            "pip install 'slviewer[raw]', or convert it to a TIFF of 16 bits without a tone curve",
         )
     import rawpy
 
@@ -41,7 +41,8 @@ def develop(data: bytes, name: str, most_pixels: int = 2**28) -> RawImage:
             if width * height > most_pixels:
                 raise InputError(
                     f"{name} is {width}x{height} px, and {most_pixels / 1e6:.0f} megapixels are"
-                    " read at most: record it at a lower resolution"
+                    " read at most",
+                    "record it at a lower resolution",
                 )
             rgb = raw.postprocess(
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
@@ -62,8 +63,8 @@ def develop(data: bytes, name: str, most_pixels: int = 2**28) -> RawImage:
         reason = error.args[0] if error.args else type(error).__name__
         text = reason.decode() if isinstance(reason, bytes) else str(reason)
         raise InputError(
-            f"{name} cannot be read as a RAW file ({text}): copy or record it again, or convert it"
-            " to DNG"
+            f"{name} cannot be read as a RAW file ({text})",
+            "copy or record it again, or convert it to DNG",
         ) from error
     if rgb.ndim == 2 or rgb.shape[2] == 1:
         rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)

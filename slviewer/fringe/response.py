@@ -79,7 +79,7 @@ def _check_response(shown: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np
         )
     if not np.isfinite(y).all():
         raise InputError(
-            "a response has light that is not a number: measure it where the projector lights the"
-            " scene"
+            "a response has light that is not a number",
+            "measure it where the projector lights the scene",
         )
     return x, y

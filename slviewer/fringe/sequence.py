@@ -70,33 +70,33 @@ class Frame:
         """Raise InputError where the fields of the frame are missing or out of range."""
         if self.kind not in get_args(Kind):
             raise InputError(
-                f"frame kind '{self.kind}' is unknown: use one of {', '.join(get_args(Kind))}"
+                f"frame kind '{self.kind}' is unknown", f"use one of {', '.join(get_args(Kind))}"
             )
         if self.axis not in (None, "x", "y"):
             raise InputError(
-                f"frame axis '{self.axis}' is unknown: use x (varies along columns) or y (along"
-                " rows)"
+                f"frame axis '{self.axis}' is unknown",
+                "use x (varies along columns) or y (along rows)",
             )
         if "axis" in _FIELDS[self.kind] and self.axis is None:
             raise InputError(
-                f"a {self.kind} frame has no axis: say x (varies along columns) or y (along rows)"
+                f"a {self.kind} frame has no axis", "say x (varies along columns) or y (along rows)"
             )
         if self.kind == "phase":
             if not 3 <= self.steps <= MAX_STEPS:
                 raise InputError(
-                    f"{self.steps} phase steps cannot be decoded: use 3 to {MAX_STEPS}"
+                    f"{self.steps} phase steps cannot be decoded", f"use 3 to {MAX_STEPS}"
                 )
             if not 0 <= self.step < self.steps:
                 raise InputError(
-                    f"phase step {self.step} of {self.steps} does not exist: count from 0"
+                    f"phase step {self.step} of {self.steps} does not exist", "count from 0"
                 )
             if not 2 <= self.period_px <= MAX_EXTENT:
                 raise InputError(
-                    f"a fringe period of {self.period_px:g} px cannot be shown: use 2 px or more"
+                    f"a fringe period of {self.period_px:g} px cannot be shown", "use 2 px or more"
                 )
         if self.kind in ("gray", "inverse") and not 0 <= self.bit < 31:
             raise InputError(
-                f"Gray bit {self.bit} does not exist: count from 0, the most significant"
+                f"Gray bit {self.bit} does not exist", "count from 0, the most significant"
             )
 
     def to_dict(self) -> dict[str, Any]:
@@ -116,10 +116,10 @@ class Frame:
         unknown = sorted(set(data) - known - {"file"})
         if unknown:
             raise InputError(
-                f"a frame has the unknown entry '{unknown[0]}': use {', '.join(sorted(known))}"
+                f"a frame has the unknown entry '{unknown[0]}'", f"use {', '.join(sorted(known))}"
             )
         if "kind" not in data:
-            raise InputError('a frame does not say its kind: add kind = "phase", "gray", ...')
+            raise InputError("a frame does not say its kind", 'add kind = "phase", "gray", ...')
         try:
             kind, axis = convert(data["kind"], str), convert(data.get("axis"), str | None)
             numbers: dict[str, Any] = {
@@ -130,7 +130,7 @@ class Frame:
             numbers["period_px"] = convert(data.get("period_px", 0.0), float, strict=False)
         except ValidationError as error:
             raise InputError(
-                f"a {data['kind']} frame has an entry that is not a number ({error}): correct it"
+                f"a {data['kind']} frame has an entry that is not a number ({error})", "correct it"
             ) from error
         values = {name: value for name, value in numbers.items() if name in _FIELDS.get(kind, ())}
         return cls(kind=kind, axis=axis, **values)  # type: ignore[arg-type]
@@ -177,7 +177,7 @@ class PatternSequence:
         size = self.projector_size
         if size is not None and (len(size) != 2 or min(size) < 1):
             raise InputError(
-                f"a projector of {size} px does not exist: give width and height, like 912x1140"
+                f"a projector of {size} px does not exist", "give width and height, like 912x1140"
             )
         for name in ("phase_sign", "gray_origin_px", "phase_offset_rad", "gray_cell_px"):
             value = getattr(self, name)
@@ -188,8 +188,8 @@ class PatternSequence:
             self._check_values(axis)
         if self.full_scale is not None and not 1 <= self.full_scale < 1 << 16:
             raise InputError(
-                f"full_scale is {self.full_scale}: give the level at which the camera clips, such"
-                " as 4095"
+                f"full_scale is {self.full_scale}",
+                "give the level at which the camera clips, such as 4095",
             )
         if self.levels is not None:
             _check_levels(self.levels)
@@ -202,8 +202,9 @@ class PatternSequence:
         """Projector size (width, height) in px. Raises InputError where it is not known."""
         if self.projector_size is None:
             raise InputError(
-                "the size of the projector is not known, and it is needed here: import the capture"
-                ' again with projector = "912x1140" (width x height), or --projector'
+                "the size of the projector is not known, and it is needed here",
+                'import the capture again with projector = "912x1140" (width x height), or'
+                " --projector",
             )
         return self.projector_size
 
@@ -282,17 +283,18 @@ class PatternSequence:
     def _check_values(self, axis: Axis) -> None:
         """Raise InputError for signs, offsets and cell widths out of range."""
         if self.sign(axis) not in (1, -1):
-            raise InputError(f"phase_sign is {self.sign(axis)}: use 1 or -1")
+            raise InputError(f"phase_sign is {self.sign(axis)}", "use 1 or -1")
         if not isfinite(self.offset_rad(axis)) or not isfinite(self.origin_px(axis)):
             raise InputError(
                 f"axis {axis}: phase_offset (phase_offset_rad) is {self.offset_rad(axis)} rad and"
-                f" gray_origin (gray_origin_px) {self.origin_px(axis)} px: give finite numbers"
+                f" gray_origin (gray_origin_px) {self.origin_px(axis)} px",
+                "give finite numbers",
             )
         cell = select_axis_value(self.gray_cell_px, axis)
         if cell is not None and not (isfinite(cell) and cell > 0):
             raise InputError(
-                f"axis {axis}: a Gray cell of {cell} px does not exist: give its width in"
-                " projector px"
+                f"axis {axis}: a Gray cell of {cell} px does not exist",
+                "give its width in projector px",
             )
 
     def _check_phase(self, axis: Axis) -> None:
@@ -307,8 +309,8 @@ class PatternSequence:
             where = f"axis {axis}, period {period:g} px"
             if len(counts) > 1:
                 raise InputError(
-                    f"{where}: the frames speak of {_join_numbers(counts)} phase steps: they must"
-                    " all say the same"
+                    f"{where}: the frames speak of {_join_numbers(counts)} phase steps",
+                    "they must all say the same",
                 )
             _check_complete([f.step for f in frames], range(counts.pop()), f"{where}: phase step")
 
@@ -325,8 +327,8 @@ class PatternSequence:
         }
         if len(stated_counts) > 1:
             raise InputError(
-                f"axis {axis}: the frames speak of {_join_numbers(stated_counts)} Gray bits: they"
-                " must all say the same"
+                f"axis {axis}: the frames speak of {_join_numbers(stated_counts)} Gray bits",
+                "they must all say the same",
             )
         needed = max([b + 1 for b in gray + inverse], default=0)
         if stated_counts:
@@ -336,13 +338,13 @@ class PatternSequence:
             _check_complete(inverse, range(needed), f"axis {axis}: inverse of Gray bit")
         if complementary > 1:
             raise InputError(
-                f"axis {axis}: {complementary} complementary frames: there is only one such bit,"
-                " keep one"
+                f"axis {axis}: {complementary} complementary frames",
+                "there is only one such bit, keep one",
             )
         if complementary and not self.periods_px(axis):
             raise InputError(
-                f"axis {axis}: a complementary bit without phase steps says nothing: call it a"
-                " Gray bit"
+                f"axis {axis}: a complementary bit without phase steps says nothing",
+                "call it a Gray bit",
             )
 
     def to_dict(self) -> dict[str, Any]:
@@ -373,19 +375,19 @@ class PatternSequence:
         """Return the sequence that `to_dict` or a `frames` TOML describes. Raises InputError."""
         frames = data.get("frame")
         if not isinstance(frames, list) or not frames:
-            raise InputError("the sequence names no frames: add a [[frame]] table for each image")
+            raise InputError("the sequence names no frames", "add a [[frame]] table for each image")
         levels, relative = data.get("levels"), data.get("relative", False)
         if levels is not None and not isinstance(levels, list):
             raise InputError(
-                f"levels is {levels!r}: give a list of 256 grey levels, or leave it out"
+                f"levels is {levels!r}", "give a list of 256 grey levels, or leave it out"
             )
         if not isinstance(relative, bool):
-            raise InputError(f"relative is {relative!r}: use true or false")
+            raise InputError(f"relative is {relative!r}", "use true or false")
         try:
             full_scale = convert(data.get("full_scale"), int | None)
         except ValidationError as error:
             raise InputError(
-                f"full_scale is {data['full_scale']!r}: give a whole number, such as 4095"
+                f"full_scale is {data['full_scale']!r}", "give a whole number, such as 4095"
             ) from error
         return cls(
             None if data.get("projector") is None else parse_size(data["projector"]),
@@ -407,10 +409,10 @@ def parse_size(text: Any) -> Size:
         width, height = convert(parts, Size, strict=False)
     except ValidationError as error:
         raise InputError(
-            f"'{text}' is not a size: write width and height in px like 912x1140"
+            f"'{text}' is not a size", "write width and height in px like 912x1140"
         ) from error
     if not (1 <= width <= MAX_EXTENT and 1 <= height <= MAX_EXTENT):
-        raise InputError(f"'{text}' is not a size: write width and height in px like 912x1140")
+        raise InputError(f"'{text}' is not a size", "write width and height in px like 912x1140")
     return width, height
 
 
@@ -433,7 +435,7 @@ def _read_values(data: Mapping[str, Any], name: str, default: Any, kind: type) -
     """
     given = data.get(name, default)
     if unknown := sorted(set(given) - set(get_args(Axis))) if isinstance(given, Mapping) else []:
-        raise InputError(f"{name} has the unknown entry '{unknown[0]}': use x and y")
+        raise InputError(f"{name} has the unknown entry '{unknown[0]}'", "use x and y")
     try:
         if isinstance(given, Mapping):
             pair = (
@@ -444,7 +446,7 @@ def _read_values(data: Mapping[str, Any], name: str, default: Any, kind: type) -
         return given if given is default else convert(given, kind, strict=False)
     except ValidationError as error:
         raise InputError(
-            f"{name} must be a number, or {{x = ..., y = ...}} ({error}): correct it"
+            f"{name} must be a number, or {{x = ..., y = ...}} ({error})", "correct it"
         ) from error
 
 
@@ -459,8 +461,8 @@ def _check_levels(levels: tuple[int, ...]) -> None:
         or list(levels) != sorted(levels)
     ):
         raise InputError(
-            f"a table of {len(levels)} grey levels cannot stand in for 0 ... 255: give 256 whole"
-            " numbers that never fall, the first 0 and the last 255, or none"
+            f"a table of {len(levels)} grey levels cannot stand in for 0 ... 255",
+            "give 256 whole numbers that never fall, the first 0 and the last 255, or none",
         )
 
 
@@ -469,13 +471,13 @@ def _check_complete(numbers: list[int], wanted: range, what: str) -> None:
     missing = sorted(set(wanted) - set(numbers))
     if missing:
         raise InputError(
-            f"{what} {_join_numbers(missing)} of {len(wanted)} is missing: add the frame, or"
-            " correct its description"
+            f"{what} {_join_numbers(missing)} of {len(wanted)} is missing",
+            "add the frame, or correct its description",
         )
     double = [value for value, count in Counter(numbers).items() if count > 1]
     if double:
         raise InputError(
-            f"{what} {_join_numbers(double)} occurs more than once: keep one frame of each"
+            f"{what} {_join_numbers(double)} occurs more than once", "keep one frame of each"
         )
 
 

@@ -45,39 +45,41 @@ class Lens:
         D = np.array(self.D, dtype=np.float64).ravel()
         if K.shape != (3, 3) or not np.isfinite(K).all():
             raise InputError(
-                f"A camera matrix must be 3x3 finite numbers, this one is {K.shape}: give K as"
-                " OpenCV does."
+                f"A camera matrix must be 3x3 finite numbers, this one is {K.shape}",
+                "give K as OpenCV does.",
             )
         form = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
         if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K, form, rtol=0, atol=1e-9 * K[0, 0]):
             raise InputError(
                 "A camera matrix must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], this one is"
-                f" {K.tolist()}: check the key and calibrate without skew."
+                f" {K.tolist()}",
+                "check the key and calibrate without skew.",
             )
         if D.size in (1, 2, 3) or D[5:].any() or not np.isfinite(D).all():
             raise InputError(
                 f"{D.size} distortion coefficients were given, {D.tolist()}, and this lens has five"
-                " (k1, k2, p1, p2, k3): calibrate without the rational, thin-prism and tilted"
-                " models."
+                " (k1, k2, p1, p2, k3)",
+                "calibrate without the rational, thin-prism and tilted models.",
             )
         D = np.concatenate([D, np.zeros(5)])[:5]
         width, height = map(int, self.size)
         if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
             raise InputError(
-                f"An image of {width}x{height} px was given: its size is width x height, 1 to"
-                f" {LARGEST_PX} px each."
+                f"An image of {width}x{height} px was given",
+                f"its size is width x height, 1 to {LARGEST_PX} px each.",
             )
         low, high = FOCAL_PX
         if not (low <= K[0, 0] <= high and low <= K[1, 1] <= high) or np.abs(K[:2, 2]).max() > high:
             raise InputError(
                 f"The focal lengths {K[0, 0]:.6g} and {K[1, 1]:.6g} px and the principal point"
                 f" ({K[0, 2]:.6g}, {K[1, 2]:.6g}) px belong to no lens (focal lengths are {low:g}"
-                f" to {high:g} px): give K in pixels."
+                f" to {high:g} px)",
+                "give K in pixels.",
             )
         if np.abs(D).max() > LARGEST_DISTORTION:
             raise InputError(
-                f"The distortion coefficients {D.tolist()} belong to no lens: check them, or"
-                " calibrate again."
+                f"The distortion coefficients {D.tolist()} belong to no lens",
+                "check them, or calibrate again.",
             )
         vars(self).update(K=read_only(K), D=read_only(D), size=(width, height))
 
@@ -121,7 +123,7 @@ class Lens:
         values = np.ascontiguousarray(values, dtype=np.float64)
         if values.shape[-1:] != (last,):
             raise InputError(
-                f"An array of shape {values.shape} was given: the last dimension must be {last}."
+                f"An array of shape {values.shape} was given", f"the last dimension must be {last}."
             )
         flat, mapped = values.reshape(-1, last), np.empty((*values.shape[:-1], 2))
         run_rows(fill, len(flat), flat, self.parameters, mapped.reshape(-1, 2), multiple=POINTS)

@@ -69,7 +69,8 @@ def fit_polynomial(
     if len(values) < len(i):
         raise InputError(
             f"{len(values)} samples are too few for a polynomial of degree {degree} with {len(i)}"
-            " coefficients: lower the degree, or check that the target is illuminated."
+            " coefficients",
+            "lower the degree, or check that the target is illuminated.",
         )
     s, t = _normalise_pixels(u, v, box)
     design = chebyshev.chebvander(t, degree)[:, i] * chebyshev.chebvander(s, degree)[:, j]
@@ -127,7 +128,8 @@ def parse_box(extent: Sequence[float]) -> Box:
     u0, v0, u1, v1 = (float(edge) for edge in extent)
     if not (u1 > u0 and v1 > v0):
         raise InputError(
-            f"The region {tuple(extent)} is empty: give (u0, v0, u1, v1) with u0 < u1 and v0 < v1."
+            f"The region {tuple(extent)} is empty",
+            "give (u0, v0, u1, v1) with u0 < u1 and v0 < v1.",
         )
     return (u0, v0, u1, v1)
 

@@ -34,8 +34,8 @@ class StereoRig:
             or np.linalg.det(R) < 0
         ):
             raise InputError(
-                f"The rotation from camera to projector is no 3x3 rotation matrix, {R.tolist()}:"
-                " check its key."
+                f"The rotation from camera to projector is no 3x3 rotation matrix, {R.tolist()}",
+                "check its key.",
             )
         if t.shape != (3,) or not np.isfinite(t).all():
             raise InputError(
@@ -44,8 +44,8 @@ class StereoRig:
             )
         if not np.linalg.norm(t) <= LARGEST_BASELINE_MM:
             raise InputError(
-                f"Camera and projector are {np.linalg.norm(t):.3g} mm apart: give the translation"
-                f" in mm, {LARGEST_BASELINE_MM:g} at most."
+                f"Camera and projector are {np.linalg.norm(t):.3g} mm apart",
+                f"give the translation in mm, {LARGEST_BASELINE_MM:g} at most.",
             )
         vars(self).update(R=read_only(R), t=read_only(t))
 

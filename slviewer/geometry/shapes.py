@@ -58,8 +58,8 @@ def fit_plane(points: np.ndarray) -> Plane:
     spread, directions = np.linalg.eigh(centred.T @ centred)
     if spread[1] <= 1e-10 * spread[2] or spread[0] > 0.5 * spread[1]:
         raise InputError(
-            f"The {len(points)} points lie on a line or in a clump, not on a plane: select a wider"
-            " region."
+            f"The {len(points)} points lie on a line or in a clump, not on a plane",
+            "select a wider region.",
         )
     normal = directions[:, 0]
     if normal[2] > 0 or (normal[2] == 0 and normal @ centroid > 0):
@@ -79,8 +79,8 @@ def fit_sphere(points: np.ndarray, radius: float | None = None) -> Sphere:
     points = points - origin  # better conditioned, and the size of the patch sets the scale
     spread = np.linalg.eigvalsh(points.T @ points / len(points))
     flat = InputError(
-        f"The {len(points)} points are too flat to be a part of a sphere: select more of the"
-        " sphere's cap."
+        f"The {len(points)} points are too flat to be a part of a sphere",
+        "select more of the sphere's cap.",
     )
     if not spread[0] > 1e-14 * spread[2]:
         raise flat
@@ -114,13 +114,13 @@ def _select_finite(points: np.ndarray, least: int, what: str) -> np.ndarray:
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
-            f"Points of shape {points.shape} were given for {what}: they must be (n, 3)."
+            f"Points of shape {points.shape} were given for {what}", "they must be (n, 3)."
         )
     finite = finite_rows(points)
     if finite.sum() < least:
         raise InputError(
-            f"{finite.sum()} points were measured, and {what} needs {least} at least: select a"
-            " wider region."
+            f"{finite.sum()} points were measured, and {what} needs {least} at least",
+            "select a wider region.",
         )
     return points[finite]
 
@@ -221,8 +221,8 @@ def _search(
     valid = points[finite_rows(points)]
     if len(valid) < 3 * needed:
         raise InputError(
-            f"{len(valid)} points were measured, too few to detect a {what}: check the capture's"
-            " exposure."
+            f"{len(valid)} points were measured, too few to detect a {what}",
+            "check the capture's exposure.",
         )
     rng = np.random.default_rng(0)
     sample = valid[rng.choice(len(valid), min(SAMPLE_SIZE, len(valid)), replace=False)]
@@ -247,8 +247,8 @@ def _search(
         refined.append(shape)
     if not refined:
         raise InputError(
-            f"No {what} was detected among {len(valid)} points to {tolerance:g} mm: "
-            "check that it fills a good part of the view."
+            f"No {what} was detected among {len(valid)} points to {tolerance:g} mm",
+            "check that it fills a good part of the view.",
         )
     best = min(refined, key=score)
     shape = fit(points[np.abs(best.distance(points)) <= tolerance])

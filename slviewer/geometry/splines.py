@@ -94,7 +94,7 @@ def fit_spline(
     nx, ny = cells
     if nx < 1 or ny < 1:
         raise InputError(
-            f"A surface of {nx}x{ny} cells was requested: at least one each way is needed."
+            f"A surface of {nx}x{ny} cells was requested", "at least one each way is needed."
         )
     u, v, values, weights = select_valid_samples(u, v, values, weights, box)
     trend = fit_polynomial(u, v, values, weights, box, TREND_DEGREE, robust)

@@ -104,8 +104,8 @@ def check_map(size: Iterable[float], values: np.ndarray, what: str) -> None:
     if np.shape(values) != (height, width):
         raise InputError(
             f"A map of {what} of shape {np.shape(values)} was given, and the camera was calibrated"
-            f" at {width}x{height} px: use captures of the same camera, at the same resolution and"
-            " without cropping."
+            f" at {width}x{height} px",
+            "use captures of the same camera, at the same resolution and without cropping.",
         )
 
 

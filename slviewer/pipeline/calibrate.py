@@ -398,7 +398,7 @@ def _diagnose_poses(
             if sequence.periods_px(axis) and sequence.find("gray", axis):
                 axis_layout(sequence, axis)
     except InputError as error:  # its periods and its Gray code conflict
-        evidence = Evidence(str(board), other_size, (), contradiction=str(error))
+        evidence = Evidence(str(board), other_size, (), contradiction=error)
         return DiagnosedCalibration(judge_evidence(evidence), evidence, None, (), dict(excluded))
     judged = list[Judged]()
     for pose in poses:

@@ -51,16 +51,20 @@ MIN_DECODED = 0.05
 and more do."""
 CONTRADICT = "contradict themselves or their neighbours"
 _FAULTS = {
-    Reason.SATURATED: "are saturated: lower the exposure or the gain, and capture again",
+    Reason.SATURATED: ("are saturated", "lower the exposure or the gain, and capture again"),
     Reason.INCONSISTENT: (
-        f"{CONTRADICT}: keep the scene and the light still, raise the exposure, and check the"
-        " description of the frames"
+        CONTRADICT,
+        "keep the scene and the light still, raise the exposure, and check the description of the"
+        " frames",
     ),
     Reason.INDIRECT: (
-        "receive much light from other surfaces or through the material: use the patterns micro,"
-        " and see docs/howto/difficult-surfaces.md"
+        "receive much light from other surfaces or through the material",
+        "use the patterns micro, and see docs/howto/difficult-surfaces.md",
     ),
-    Reason.OUTSIDE: "lie outside the projector: check the size of the projector and the periods",
+    Reason.OUTSIDE: (
+        "lie outside the projector",
+        "check the size of the projector and the periods",
+    ),
 }
 """Why illuminated pixels do not decode, and what to do."""
 
@@ -78,11 +82,12 @@ def decode_capture(
     for axis, phase in phases.items():
         if phase.is_relative and not relative:
             raise InputError(
-                f"{capture.name}: the phase of axis {axis} repeats every {phase.unambiguous_px:g}"
-                " px of the projector, so that it gives no projector coordinate: `slviewer"
-                " reconstruct --depth-range NEAR FAR` measures a scan whose depths are known,"
-                " `slviewer decode` writes the phase as it is; calibrate with patterns that cover"
-                " the projector"
+                f"the phase of axis {axis} repeats every {phase.unambiguous_px:g} px of the"
+                " projector, so that it gives no projector coordinate",
+                "`slviewer reconstruct --depth-range NEAR FAR` measures a scan whose depths are"
+                " known, `slviewer decode` writes the phase as it is; calibrate with patterns that"
+                " cover the projector",
+                capture.name,
             )
     return phases
 
@@ -132,7 +137,7 @@ def decode_frames(
         light = light or estimate_frame_light(sequence, frames)
         return {axis: decode(sequence, frames, axis, light) for axis in sequence.axes}
     except InputError as error:
-        raise InputError(f"{name}: {error}") from error
+        raise error.within(name) from error
 
 
 def decode_or_explain(
@@ -167,7 +172,9 @@ def decode_examined(
 def raise_rejected(name: str, examination: Examination) -> None:
     """Raise InputError where the examination of a capture rejects it."""
     if examination.rejected:
-        raise InputError(f"{name}: {'; '.join(f.text() for f in examination.rejected)}")
+        *others, last = examination.rejected
+        observation = "; ".join([*(f.text() for f in others), last.sentence])
+        raise InputError(observation, last.remedy, name)
 
 
 def check_capture(
@@ -191,23 +198,33 @@ def check_capture(
             continue
         if illuminated:
             reasons = phase.reason[phase.illuminated]
-            share, fault = max((np.mean(reasons == each), fault) for each, fault in _FAULTS.items())
-            if fault.startswith(CONTRADICT) and examination.findings:
-                fault = "; ".join([CONTRADICT, *(f.text() for f in examination.findings)])
+            share, fault, remedy = max(
+                (np.mean(reasons == each), *fault) for each, fault in _FAULTS.items()
+            )
+            if fault == CONTRADICT and examination.findings:
+                *others, last = examination.findings
+                fault = "; ".join([CONTRADICT, *(f.text() for f in others), last.sentence])
+                remedy = last.remedy
             raise InputError(
-                f"{name}: {decoded} of {illuminated} illuminated pixels"
+                f"{decoded} of {illuminated} illuminated pixels"
                 f" ({100 * decoded / illuminated:.1f} %) give a coordinate along {axis};"
-                f" {100 * share:.0f} % of them {fault}"
+                f" {100 * share:.0f} % of them {fault}",
+                remedy,
+                name,
             )
         if unexplained := estimate_frame_light(sequence, frames).unexplained:
+            disturbance = describe_disturbance(unexplained)
             raise InputError(
-                f"{name}: no pixel carries a readable {axis} pattern:"
-                f" {describe_disturbance(unexplained).text()}"
+                f"no pixel carries a readable {axis} pattern: {disturbance.sentence}",
+                disturbance.remedy,
+                name,
             )
         middle = float(np.median(phase.modulation))
         raise InputError(
-            f"{name}: no pixel carries a readable {axis} pattern (the modulation is {middle:.1f}"
-            " grey levels in the median): raise the exposure or the projector's brightness"
+            f"no pixel carries a readable {axis} pattern (the modulation is {middle:.1f} grey"
+            " levels in the median)",
+            "raise the exposure or the projector's brightness",
+            name,
         )
 
 
@@ -477,7 +494,7 @@ def write_decoded(
     ``decoded.png``. Files of the same names are replaced. Raises InputError like `decode_capture`.
     """
     if file_format not in get_args(MapFormat):
-        raise InputError(f"maps cannot be written as '{file_format}': use npy or exr")
+        raise InputError(f"maps cannot be written as '{file_format}'", "use npy or exr")
     folder, files = Path(out), dict[str, str]()
     with opened(session) as store:
         progress(0.1, "decoding")

@@ -42,7 +42,7 @@ from slviewer.pipeline.capture_phases import (
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.reconstruction.camera_match import Lines
 from slviewer.records.record import to_plain
-from slviewer.records.verdict import Cause, Examination
+from slviewer.records.verdict import Cause, Examination, Finding
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -51,7 +51,7 @@ from slviewer.target.detect import Detection, board_mask, detect
 LINES_DEGREE = 5
 """Of the polynomial through a board's features: perspective and distortion leave less than
 noise."""
-EVIDENCE_VERSION = 11
+EVIDENCE_VERSION = 12
 """Version of the examination; evidence that was stored by another version is computed again."""
 POSES_AT_ONCE = 2
 """Poses read side by side: most of the work on one occupies one thread."""
@@ -100,7 +100,7 @@ def read_pose(
     name, sequence, frames, phases = pose.name, pose.sequence, pose.look.stack, pose.phases
     detection: Detection | None = None
     observation: Observation | None = None
-    refused, cause = "", ""
+    refused, misfit = "", None
     try:
         if pose.fault:
             raise InputError(pose.fault)
@@ -114,7 +114,9 @@ def read_pose(
             observed(observation)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
-        cause = error.cause if isinstance(error, BoardError) else ""
+        if isinstance(error, BoardError):
+            cause = cast(Cause, error.cause)
+            misfit = Finding(cause, "rejected", error.observation, error.remedy)
     examine_them = examined or partial(examine_frames, sequence, frames, look=pose.look)
     checked = examine_them() if examine else None
     if observation is not None:
@@ -124,7 +126,7 @@ def read_pose(
             refused = str(error).removeprefix(f"{name}: ")
     evidence = None
     if checked is not None:
-        evidence = gather_evidence(pose, checked, detection, observation, refused, cause)
+        evidence = gather_evidence(pose, checked, detection, observation, refused, misfit)
     return Judged(name, None if refused else observation, refused, evidence)
 
 
@@ -293,11 +295,11 @@ def gather_evidence(
     detection: Detection | None,
     observation: Observation | None,
     refused: str,
-    cause: str = "",
+    misfit: Finding | None = None,
 ) -> PoseEvidence:
     """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
-    None where they could not be read, for the reason ``refused`` and its ``cause``;
-    ``examination``: of its frames.
+    None where they could not be read, for the reason ``refused``; ``misfit``: by which
+    the board contradicts its description; ``examination``: of its frames.
     """
     sequence, frames, board = pose.sequence, pose.look.stack, pose.board
     grid, on_board, moved_px = None, None, np.nan
@@ -325,6 +327,6 @@ def gather_evidence(
         displaced=measure_white_delay(sequence, frames),
         moved_px=moved_px,
         turn=turn,
-        cause=cast(Cause, cause),
+        misfit=misfit,
         upright=is_oriented,
     )

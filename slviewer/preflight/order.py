@@ -57,15 +57,15 @@ def judge_order(sequence: PatternSequence, examination: Examination) -> Check:
     if found[0].cause == "frame-lag" and found[0].value:
         figures["lag"] = int(found[0].value)
     findings = "; ".join(dict.fromkeys(f.sentence for f in found[:3]))
-    remedy = format_remedy(found[0].remedy)
+    remedy = format_sentence(found[0].remedy)
     is_rejected = any(f.severity == "rejected" for f in found)
     verdict: CheckVerdict = "bad" if is_rejected else "warning"
     return Check("order", verdict, f"Of {n} frames, {findings}.", remedy, figures)
 
 
-def format_remedy(text: str) -> str:
-    """Return a remedy, or another part of a message, as a sentence."""
-    return f"{text[:1].upper()}{text[1:]}."
+def format_sentence(text: str) -> str:
+    """Return an observation or a remedy as a sentence; "" for none."""
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
 def check_burst(bench: RigUnderTest) -> Check:
@@ -88,8 +88,8 @@ def check_burst(bench: RigUnderTest) -> Check:
     try:
         burst = capture_frames(replace(rig, bursts=True), sequence)
     except DeviceError as error:
-        what, _, remedy = str(error).rpartition(": ")
-        return Check("burst", "bad", format_remedy(what), format_remedy(remedy), figures)
+        sentence, remedy = format_sentence(error.observation), format_sentence(error.remedy)
+        return Check("burst", "bad", sentence, remedy, figures)
     bursts, singles = (
         stack[:, :: bench.stride, :: bench.stride][:, bench.illuminated].astype(np.float32)
         for stack in (burst, single)

@@ -30,7 +30,7 @@ from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import (
     MISPLACING_CAUSES,
     check_repeats,
-    format_remedy,
+    format_sentence,
     judge_order,
 )
 from slviewer.records.verdict import LIGHT_CAUSES, Cause, Examination
@@ -82,16 +82,16 @@ def _check_frames(capture: Capture, progress: Progress) -> Preflight:
     )
     progress(0.6, "decoding")
     try:
-        phases = decode_frames(capture.name, sequence, frames, look.light)
+        phases = decode_frames("", sequence, frames, look.light)
     except InputError as error:
-        description = _check_description(capture.name, examination, error)
+        description = _check_description(examination, error)
         return Preflight((description, *compared), None, None, None, time.monotonic() - began)
     repeats = check_repeats(sequence, frames)
     try:
-        check_capture(capture.name, sequence, frames, phases, examination)
-        description = _check_description(capture.name, examination)
+        check_capture("", sequence, frames, phases, examination)
+        description = _check_description(examination)
     except InputError as error:
-        description = _check_description(capture.name, examination, error)
+        description = _check_description(examination, error)
     checks = (
         description,
         *compared,
@@ -105,9 +105,7 @@ def _check_frames(capture: Capture, progress: Progress) -> Preflight:
     return Preflight(checks, None, None, None, time.monotonic() - began)
 
 
-def _check_description(
-    name: str, examination: Examination, error: InputError | None = None
-) -> Check:
+def _check_description(examination: Examination, error: InputError | None = None) -> Check:
     """Check that the frames agree with the description of their patterns, and contradict each other
     in nothing that another check reports; ``error``: by which they were refused."""
     others = [f for f in examination.findings if f.cause not in _CAUSES_ELSEWHERE]
@@ -116,10 +114,10 @@ def _check_description(
         verdict: CheckVerdict = "bad" if examination.rejected else "warning"
         remedy = "; ".join(dict.fromkeys(f.remedy for f in found))
         sentence = _join_findings([f.sentence for f in found])
-        return Check("description", verdict, sentence, format_remedy(remedy), {})
+        return Check("description", verdict, sentence, format_sentence(remedy), {})
     if error:
-        text, _, remedy = str(error).removeprefix(f"{name}: ").rpartition(": ")
-        return Check("description", "bad", _join_findings([text]), format_remedy(remedy), {})
+        sentence = format_sentence(error.located_observation)
+        return Check("description", "bad", sentence, format_sentence(error.remedy), {})
     return Check(
         "description", "good", "The frames agree with the description of the patterns.", "", {}
     )
@@ -254,4 +252,4 @@ def _list_sentences(examination: Examination, *causes: Cause) -> list[str]:
 
 def _join_findings(findings: Sequence[str]) -> str:
     """Join findings, each once, to a sentence."""
-    return format_remedy("; ".join(dict.fromkeys(findings)))
+    return format_sentence("; ".join(dict.fromkeys(findings)))

@@ -3,6 +3,7 @@
 from slviewer.devices.protocols import Turntable, report_driver_faults
 from slviewer.errors import DeviceError, InputError
 from slviewer.pipeline.examination import Check
+from slviewer.preflight.order import format_sentence
 
 _TURN_DEG = 2.0
 _TOLERANCE_DEG = 0.2
@@ -29,10 +30,8 @@ def check_turning(table: Turntable) -> Check:
             finally:
                 table.close()
     except (InputError, DeviceError) as error:
-        sentence, _, remedy = str(error).rpartition(": ")
-        return Check(
-            "turntable", "bad", f"{sentence}.", f"{remedy[:1].upper()}{remedy[1:]}.", figures
-        )
+        remedy = format_sentence(error.remedy)
+        return Check("turntable", "bad", f"{error.observation}.", remedy, figures)
     if abs(error_deg) > _TOLERANCE_DEG:
         sentence = f"{table.name} stops {error_deg:+.2f} degrees off."
         return Check(

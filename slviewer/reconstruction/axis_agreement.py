@@ -181,7 +181,8 @@ def check_sizes(name: str, camera: Size, projector: Size | None, calibrated: Ste
         if size is not None and tuple(size) != wanted:
             raise InputError(
                 f"{name}: the capture was taken with a {what} of {_size(size)} px, the calibration"
-                f" was made with {_size(wanted)}{_scale(size, wanted)}: {remedy}"
+                f" was made with {_size(wanted)}{_scale(size, wanted)}",
+                remedy,
             )
 
 

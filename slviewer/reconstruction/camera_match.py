@@ -91,9 +91,9 @@ def match_cameras(
     if len(axes) == 1:
         if lines is None:
             raise InputError(
-                "Cannot match the two cameras: their patterns have one axis, and no calibration of"
-                " the cameras gives the other. Calibrate from target poses, or import a"
-                " calibration."
+                "Cannot match the two cameras",
+                "their patterns have one axis, and no calibration of the cameras gives the other."
+                " Calibrate from target poses, or import a calibration.",
             )
         axes = lines.axes
         for k, rows in enumerate((lines.first, lines.second)):

@@ -91,8 +91,8 @@ class Cloud:
         points, shape = self.points, self.sigma_z.shape
         if points.ndim != 3 or points.shape[2] != 3 or shape != points.shape[:2]:
             raise InputError(
-                f"Points of shape {points.shape} and sigma_z of shape {shape} make no cloud: (h, w,"
-                " 3) and (h, w) are needed."
+                f"Points of shape {points.shape} and sigma_z of shape {shape} make no cloud",
+                "(h, w, 3) and (h, w) are needed.",
             )
         for name in ("sigma_calibration", "sigma_edges"):
             values = getattr(self, name)
@@ -190,8 +190,9 @@ def _convert_texture(texture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if texture.shape not in (shape, (*shape, 3)):
         raise InputError(
             f"A texture of shape {texture.shape} does not belong to a cloud of"
-            f" {shape[1]}x{shape[0]} pixels: use the one of the same capture."
+            f" {shape[1]}x{shape[0]} pixels",
+            "use the one of the same capture.",
         )
     if texture.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"A texture of {texture.dtype} was given: it must be uint8 or uint16.")
+        raise InputError(f"A texture of {texture.dtype} was given", "it must be uint8 or uint16.")
     return to_eight_bits(texture)

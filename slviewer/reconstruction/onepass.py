@@ -86,7 +86,7 @@ class OnePass:
         self.layout = one_pass_layout(sequence, axis)
         if axis not in model.axes:
             raise InputError(
-                f"The {model.name} calibration has no axis {axis}: choose another axis."
+                f"The {model.name} calibration has no axis {axis}", "choose another axis."
             )
         self.depths, self.shape = self._pack_depths()
         kinds = [frame.kind for frame in sequence.frames]
@@ -103,8 +103,8 @@ class OnePass:
             depths = _splined(self.model, self.axis, self.layout.period_px)
         else:
             raise InputError(
-                f"A {self.model.name} calibration measures no cloud in one pass: use the pixelwise"
-                " or the splined one."
+                f"A {self.model.name} calibration measures no cloud in one pass",
+                "use the pixelwise or the splined one.",
             )
         _, height, width = depths.c.shape
         return depths, (height, width)
@@ -194,8 +194,8 @@ class OnePass:
         scan = self._allocate(frames.dtype, light) if out is None else replace(out, light=light)
         if scan.texture.dtype != frames.dtype or scan.points.shape[:2] != self.shape:
             raise InputError(
-                "The arrays to write into belong to other frames: leave them out, and new ones are"
-                " made."
+                "The arrays to write into belong to other frames",
+                "leave them out, and new ones are made.",
             )
         return frames, scan
 
@@ -225,7 +225,7 @@ def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
         what = "A relative phase"
     else:
         return layout
-    raise InputError(f"{what} is not measured in one pass: decode and reconstruct it")
+    raise InputError(f"{what} is not measured in one pass", "decode and reconstruct it")
 
 
 def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.Depths:

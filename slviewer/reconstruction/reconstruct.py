@@ -86,19 +86,20 @@ def reconstruct_cloud(
     if axis is not None:
         if axis not in phases:
             raise InputError(
-                f"The capture holds no axis {axis}, only {_join_axes(phases)}: choose one of these."
+                f"The capture holds no axis {axis}, only {_join_axes(phases)}",
+                "choose one of these.",
             )
         if axis not in model.axes:
             raise InputError(
-                f"The {model.name} calibration has no axis {axis}, only {_join_axes(model.axes)}: "
-                f"choose one of these, or calibrate with captures of axis {axis}."
+                f"The {model.name} calibration has no axis {axis}, only {_join_axes(model.axes)}",
+                f"choose one of these, or calibrate with captures of axis {axis}.",
             )
     axes = [shared for shared in model.axes if shared in phases] if axis is None else [axis]
     if not axes:
         raise InputError(
             f"The capture holds axis {_join_axes(phases)} and the {model.name} calibration"
-            f" {_join_axes(model.axes)}: capture along an axis that is calibrated, or calibrate"
-            " with the captured one."
+            f" {_join_axes(model.axes)}",
+            "capture along an axis that is calibrated, or calibrate with the captured one.",
         )
     measured = {each: _measure(model, phases[each], extrapolates) for each in axes}
     axis = _select_axis(measured)
@@ -138,8 +139,8 @@ def _measure(model: Model, phase: PhaseMap, extrapolates: bool) -> Measured:
     for Gray code alone; and which points (h, w) bool are extrapolated, None where none are."""
     if phase.is_relative:
         raise InputError(
-            f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px: resolve it"
-            " by a depth range."
+            f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px",
+            "resolve it by a depth range.",
         )
     phase, remaining_px = phase.correct_edges()
     extrapolated = None

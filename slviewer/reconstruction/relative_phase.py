@@ -39,8 +39,8 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
     near, far = depth_range_mm
     if not 0 < near < far < np.inf:
         raise InputError(
-            f"depths from {near:g} to {far:g} mm are not a range: give the nearest depth first,"
-            " both positive"
+            f"depths from {near:g} to {far:g} mm are not a range",
+            "give the nearest depth first, both positive",
         )
     reach = phase.unambiguous_px
     rays = rig.camera.rays()

@@ -467,8 +467,8 @@ class Measurement(Record, frozen=True, kw_only=True):
             if quantity.name == name:
                 return quantity
         raise InputError(
-            f"there is no {name!r}: the quantities are"
-            f" {', '.join(each.name for each in self.quantities)}"
+            f"there is no {name!r}",
+            f"the quantities are {', '.join(each.name for each in self.quantities)}",
         )
 
     @property

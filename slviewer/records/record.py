@@ -52,7 +52,7 @@ def from_plain(data: Any, kind: type[T]) -> T:
     except msgspec.ValidationError as error:
         reason, _, place = str(error).replace("`", "").partition(" - at $")
         raise InputError(
-            f"{place.strip('.') or 'its content'}: {reason[:1].lower()}{reason[1:]}"
+            f"{reason[:1].lower()}{reason[1:]}", place=place.strip(".") or "its content"
         ) from error
 
 
@@ -151,7 +151,8 @@ class Table:
             if len(row) != len(self.columns):
                 raise InputError(
                     f"a row of the table '{self.caption}' has {len(row)} cells and the table"
-                    f" {len(self.columns)} columns: give one cell a column"
+                    f" {len(self.columns)} columns",
+                    "give one cell a column",
                 )
         aligned = [
             column if column.align else replace(column, align="left" if is_text else "right")

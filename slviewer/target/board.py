@@ -116,8 +116,9 @@ class Board:
         example = _find_example(self.kind)
         if not example:
             raise InputError(
-                f"there is no board of kind '{self.kind}': use one of {', '.join(board_examples())}"
-                + BOARD_PLUGINS.explain_missing(self.kind)
+                f"there is no board of kind '{self.kind}'",
+                f"use one of {', '.join(board_examples())}"
+                + BOARD_PLUGINS.explain_missing(self.kind),
             )
         if self.kind == LEGACY:
             object.__setattr__(self, "kind", "charuco")
@@ -125,8 +126,8 @@ class Board:
         fewest = {"acircles": (2, 3)}.get(self.kind, (3, 3) if self.kind in EXAMPLES else (1, 1))
         if not (fewest[0] <= self.columns <= 200 and fewest[1] <= self.rows <= 200):
             raise InputError(
-                f"a {self.kind} board of {self.columns}x{self.rows} cannot be used: give"
-                f" {fewest[0]} to 200 columns and {fewest[1]} to 200 rows, as in '{example}'"
+                f"a {self.kind} board of {self.columns}x{self.rows} cannot be used",
+                f"give {fewest[0]} to 200 columns and {fewest[1]} to 200 rows, as in '{example}'",
             )
         self._check_pitches(example)
         if self.kind == "charuco":
@@ -134,7 +135,7 @@ class Board:
             # the layouts differ with an even number of rows only
             object.__setattr__(self, "legacy", self.legacy and self.rows % 2 == 0)
         elif self.marker_mm or self.dictionary or self.legacy:
-            raise InputError(f"a {self.kind} board has no markers: omit marker and dictionary")
+            raise InputError(f"a {self.kind} board has no markers", "omit marker and dictionary")
 
     def _check_pitches(self, example: str) -> None:
         """Set the default of the pitch along y, and raise InputError for pitches that no board
@@ -144,16 +145,19 @@ class Board:
         for pitch in self.pitches.tolist():
             if not (math.isfinite(pitch) and 0.01 <= pitch <= 10_000):
                 raise InputError(
-                    f"a pitch of {pitch:g} mm cannot be used: give 0.01 to 10000 mm, as in"
-                    f" '{example}'"
+                    f"a pitch of {pitch:g} mm cannot be used",
+                    f"give 0.01 to 10000 mm, as in '{example}'",
                 )
         if self.pitch_y_mm != self.pitch_mm and self.plugin_type:
-            raise InputError(f"a {self.kind} board comes from a plugin and has one pitch: give one")
+            raise InputError(
+                f"a {self.kind} board comes from a plugin and has one pitch", "give one"
+            )
         if not 1 / MAX_STRETCH <= self.pitch_y_mm / self.pitch_mm <= MAX_STRETCH:
             raise InputError(
                 f"pitches of {self.pitch_mm:g} mm along x and {self.pitch_y_mm:g} mm along y cannot"
-                f" be used: their ratio is at most {MAX_STRETCH:g}, and a board drawn with square"
-                " cells is needed"
+                " be used",
+                f"their ratio is at most {MAX_STRETCH:g}, and a board drawn with square cells is"
+                " needed",
             )
 
     def _check_markers(self) -> None:
@@ -165,20 +169,21 @@ class Board:
             object.__setattr__(self, "dictionary", DEFAULT_DICTIONARY)
         if not 0.2 * self.pitch_mm <= self.marker_mm <= 0.95 * self.pitch_mm:
             raise InputError(
-                f"markers of {self.marker_mm:g} mm do not fit squares of {self.pitch_mm:g} mm: "
-                "give 0.2 to 0.95 of the square, as in 'charuco:8x6:30:22.5'"
+                f"markers of {self.marker_mm:g} mm do not fit squares of {self.pitch_mm:g} mm",
+                "give 0.2 to 0.95 of the square, as in 'charuco:8x6:30:22.5'",
             )
         known = _DICTIONARY.fullmatch(self.dictionary)
         if not known:
             raise InputError(
-                f"'{self.dictionary}' is not a marker dictionary of OpenCV's 4x4 to 7x7 families: "
-                "write for example 'charuco:8x6:30:22.5:DICT_5X5_1000'"
+                f"'{self.dictionary}' is not a marker dictionary of OpenCV's 4x4 to 7x7 families",
+                "write for example 'charuco:8x6:30:22.5:DICT_5X5_1000'",
             )
         needed = self.columns * self.rows // 2
         if needed > int(known[2]):
             raise InputError(
                 f"a ChArUco board of {self.columns}x{self.rows} squares needs {needed} markers, and"
-                f" {self.dictionary} has {known[2]}: choose a larger dictionary"
+                f" {self.dictionary} has {known[2]}",
+                "choose a larger dictionary",
             )
 
     @classmethod
@@ -189,17 +194,18 @@ class Board:
         example = _find_example(kind)
         if not example:
             raise InputError(
-                f"board '{notation}' is not understood: start it with one of"
-                f" {', '.join(board_examples())}, for example '{EXAMPLES['circles']}'"
-                + BOARD_PLUGINS.explain_missing(kind)
+                f"board '{notation}' is not understood",
+                f"start it with one of {', '.join(board_examples())}, for example"
+                f" '{EXAMPLES['circles']}'" + BOARD_PLUGINS.explain_missing(kind),
             )
         is_charuco = kind in ("charuco", LEGACY)
         most = 4 if is_charuco else 2
         if not 2 <= len(fields) <= most:
             raise InputError(
-                f"board '{notation}' has {len(fields)} fields after the kind: give columns x rows"
-                f" and the {'side of a square' if is_charuco or kind == 'chessboard' else 'pitch'}"
-                f" in mm, as in '{example}'"
+                f"board '{notation}' has {len(fields)} fields after the kind",
+                "give columns x rows and the"
+                f" {'side of a square' if is_charuco or kind == 'chessboard' else 'pitch'} in mm,"
+                f" as in '{example}'",
             )
         size = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", fields[0])
         if not size:
@@ -256,7 +262,8 @@ class Board:
             if not (is_flat and np.isfinite(points).all()):
                 raise InputError(
                     f"the plugin of {self.kind} boards gives points of shape {points.shape} for"
-                    f" {columns}x{rows} features: it must give (n, 3) mm with z = 0, row by row"
+                    f" {columns}x{rows} features",
+                    "it must give (n, 3) mm with z = 0, row by row",
                 )
         points.flags.writeable = False
         return points

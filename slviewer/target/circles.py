@@ -128,7 +128,7 @@ def detect_circles(board: Board, image: BoardImage) -> tuple[Floats, float, bool
         grid = _match_board(board, complete_lattice(most.largest, pool), pool, image)
         if grid:
             return _measure(board, image, grid)
-    raise DetectionError(_failure_message(board, image, most))
+    raise _describe_failure(board, image, most)
 
 
 def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
@@ -180,7 +180,8 @@ def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage
             if len(fitting) > 1 or _grid_continues(board, grid_map, blobs, numberings[0]):
                 raise DetectionError(
                     f"{len(candidate)} circles in one grid detected where {board} has"
-                    f" {len(board.points)}: check the board's columns and rows"
+                    f" {len(board.points)}",
+                    "check the board's columns and rows",
                 )
             return _Grid(blobs, numberings)
     return None
@@ -245,7 +246,8 @@ def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
         (a, b), (c, d) = (grid.centres.mean(0) for grid in grids[:2])
         raise DetectionError(
             f"{len(grids)} boards {board} detected, around pixels {a:.0f}, {b:.0f} and {c:.0f},"
-            f" {d:.0f}: take one out of view; a mirror image counts as well"
+            f" {d:.0f}",
+            "take one out of view; a mirror image counts as well",
         )
     return grids[0]
 
@@ -259,26 +261,27 @@ def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[Floats, floa
     """
     marked = select_numbering_by_mark(board, image.deep, grid.blobs.centres, grid.numberings)
     if marked is None and is_mark_mirrored(board, image.deep, grid.blobs.centres, grid.numberings):
-        raise BoardError("axis-reversed", MIRRORED)
+        raise BoardError(*MIRRORED, cause="axis-reversed")
     order = select_upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
     blobs = grid.blobs.select(order)
     large = blobs.areas > MIN_SHAPE_AREA_PX
     if large.all() and np.median(blobs.roundness) < SQUARE_LIMIT_ROUNDNESS:
         raise DetectionError(
-            f"a grid of squares detected where {board} has circles: check the board's kind"
+            f"a grid of squares detected where {board} has circles", "check the board's kind"
         )
     covered = np.count_nonzero(large & (blobs.roundness < WHOLE_CIRCLE_ROUNDNESS))
     if covered:
         raise DetectionError(
-            f"{covered} of {len(blobs.areas)} circles are partly covered, or reflect: "
-            "uncover the board, and turn it away from the lights"
+            f"{covered} of {len(blobs.areas)} circles are partly covered, or reflect",
+            "uncover the board, and turn it away from the lights",
         )
     pixels = refine_centres(image.deep, blobs)
     unmeasured = np.count_nonzero(~finite_rows(pixels))
     if unmeasured:
         raise DetectionError(
             f"{unmeasured} of {len(pixels)} circles are too close to their neighbours or too faint"
-            " to measure: move the board closer, or focus the camera"
+            " to measure",
+            "move the board closer, or focus the camera",
         )
     check_grid(board, pixels, np.arange(len(pixels)), "circles")
     points = board.points[:, :2]
@@ -303,17 +306,22 @@ def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
     return pool
 
 
-def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None) -> str:
-    """Return the error message: number of detected circles, other blobs, and what to do."""
+def _describe_failure(
+    board: Board, image: BoardImage, most: _Binarisation | None
+) -> DetectionError:
+    """Return the error: number of detected circles, other blobs, and what to do."""
     total, detected = len(board.points), len(most.largest) if most else 0
     if most is None or detected < 6:
-        return f"no grid of circles detected where {board} has {total}: {light_advice(image.grey)}"
+        return DetectionError(
+            f"no grid of circles detected where {board} has {total}", light_advice(image.grey)
+        )
     longer, shorter = most.largest.extent
     others = len(most.blobs.centres) - detected
     if detected >= total:
-        return (
+        return DetectionError(
             f"{detected} circles detected in a grid of {longer}x{shorter} that does not hold all of"
-            f" {board}: check the board's columns and rows, and that nothing covers it"
+            f" {board}",
+            "check the board's columns and rows, and that nothing covers it",
         )
     facts = [f"{detected} of {total} circles of {board} detected"]
     if others:
@@ -327,7 +335,7 @@ def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None
     sides = [side for side, gap in gaps.items() if gap < 1.5 * spacing]
     if sides:
         facts.append(f"up to the {' and the '.join(sides)} border of the image")
-    return f"{', '.join(facts)}: {light_advice(image.grey)}"
+    return DetectionError(", ".join(facts), light_advice(image.grey))
 
 
 def refine_centres(image: Floats32, blobs: Blobs) -> Floats:

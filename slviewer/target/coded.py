@@ -145,8 +145,8 @@ def draw_marker_sheet(notation: str) -> Drawing:
     if match := re.fullmatch(r"mat:(\d{1,3}(?:\.\d{1,2})?)", notation):
         return _draw_mat(float(match[1]))
     raise InputError(
-        f"{notation!r} is not a sheet of markers: write markers:0-23:20 (numbers, mm) or mat:16"
-        " (mm)"
+        f"{notation!r} is not a sheet of markers",
+        "write markers:0-23:20 (numbers, mm) or mat:16 (mm)",
     )
 
 
@@ -154,16 +154,17 @@ def _draw_numbers(first: int, last: int, side: float) -> Drawing:
     """Draw a sheet of markers with cutting marks and numbers."""
     if not (5 <= side <= 150 and first <= last < MOST_MARKERS):
         raise InputError(
-            f"markers {first} to {last} of {side:g} mm are not possible: give numbers from 0 to"
-            f" {MOST_MARKERS - 1} in ascending order, and a side of 5 to 150 mm"
+            f"markers {first} to {last} of {side:g} mm are not possible",
+            f"give numbers from 0 to {MOST_MARKERS - 1} in ascending order, and a side of 5 to 150"
+            " mm",
         )
     pitch = side * (1 + 2 * _QUIET) + 4.0
     columns, rows = (int((length + 1e-9) // pitch) for length in _PAGE_MM)
     count = last - first + 1
     if count > columns * rows:
         raise InputError(
-            f"{count} markers of {side:g} mm do not fit on A4, {columns * rows} do: make several"
-            " sheets"
+            f"{count} markers of {side:g} mm do not fit on A4, {columns * rows} do",
+            "make several sheets",
         )
     drawing = Drawing(210.0, 297.0)
     for i in range(count):
@@ -180,7 +181,7 @@ def _draw_numbers(first: int, last: int, side: float) -> Drawing:
 def _draw_mat(side: float) -> Drawing:
     """Draw a ring of markers on A4 about a cross that marks the turntable's axis."""
     if not 8 <= side <= 40:
-        raise InputError(f"a mat with markers of {side:g} mm is not possible: give 8 to 40 mm")
+        raise InputError(f"a mat with markers of {side:g} mm is not possible", "give 8 to 40 mm")
     pitch = side * (1 + 2 * _QUIET)
     drawing = Drawing(210.0, 297.0)
     centre, outer = np.array([105.0, 148.5]), 95.0 - side

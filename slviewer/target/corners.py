@@ -90,12 +90,13 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[Floats, np.ndarray]
         _, _, outlines, marker_ids = detector.detectBoard(mirrored)
         layouts = (board, replace(board, legacy=not board.legacy))
         if max(_count_fitting(each, outlines, marker_ids) for each in layouts) > MIN_MARKER_CORNERS:
-            raise BoardError("axis-reversed", MIRRORED)
+            raise BoardError(*MIRRORED, cause="axis-reversed")
     if len(ids) < MIN_CORNERS:
         total_markers = board.columns * board.rows // 2
         raise DetectionError(
             f"{len(ids)} of {len(board.points)} corners and {markers} of {total_markers} markers of"
-            f" {board} detected, and a pose needs {MIN_CORNERS}: {light_advice(image.grey)}"
+            f" {board} detected, and a pose needs {MIN_CORNERS}",
+            f"{light_advice(image.grey)}",
         )
     check_grid(board, pixels, ids, "corners")
     return pixels, ids
@@ -112,10 +113,10 @@ def _check_layout(
     count, count_other = (_count_fitting(each, outlines, marker_ids) for each in (board, other))
     if count_other >= max(MIN_MARKER_CORNERS, count + 4):  # a marker more
         raise BoardError(
-            "board-size",
             f"{count_other} of {4 * len(outlines)} corners of the markers fit {other}, a layout"
-            f" {'before' if other.legacy else 'since'} OpenCV 4.6, and {count} fit {board}: give"
-            f" the board as {other}",
+            f" {'before' if other.legacy else 'since'} OpenCV 4.6, and {count} fit {board}",
+            f"give the board as {other}",
+            cause="board-size",
         )
 
 
@@ -156,7 +157,7 @@ def detect_chessboard(board: Board, image: BoardImage) -> Floats:
     largest = _detect_largest(image.grey)
     is_larger = largest is not None and largest[..., 0].size > len(board.points)
     if first_error is None or is_larger:
-        raise DetectionError(_failure_message(board, image.grey, largest))
+        raise _describe_failure(board, image.grey, largest)
     raise first_error
 
 
@@ -176,7 +177,8 @@ def _verify_grid(board: Board, image: BoardImage, grid: Floats) -> Floats:
     if not good.all():
         raise DetectionError(
             f"{np.count_nonzero(~good)} of {len(good)} corners are covered or blurred beyond"
-            " measuring: uncover the board, focus the camera, and avoid reflections"
+            " measuring",
+            "uncover the board, focus the camera, and avoid reflections",
         )
     check_grid(board, pixels, np.arange(len(pixels)), "corners")
     grid = pixels.reshape(grid.shape)
@@ -227,22 +229,23 @@ def _detect_largest(grey: np.ndarray) -> Floats | None:
     return to_full_image(corners, factor).reshape(*cells.shape[:2], 2) if success else None
 
 
-def _failure_message(board: Board, grey: np.ndarray, largest: Floats | None) -> str:
-    """Return the error message: the largest chessboard detected, if any, and what to do."""
+def _describe_failure(board: Board, grey: np.ndarray, largest: Floats | None) -> DetectionError:
+    """Return the error: the largest chessboard detected, if any, and what to do."""
     if largest is None:
-        return (
-            f"no chessboard detected where {board} has {len(board.points)} corners:"
-            f" {light_advice(grey)}"
+        return DetectionError(
+            f"no chessboard detected where {board} has {len(board.points)} corners",
+            light_advice(grey),
         )
     rows, columns = largest.shape[:2]
     if rows * columns <= len(board.points):
-        return (
+        return DetectionError(
             f"{rows * columns} of {len(board.points)} corners of {board} detected"
-            f" ({columns}x{rows}): {light_advice(grey)}"
+            f" ({columns}x{rows})",
+            light_advice(grey),
         )
-    return (
-        f"a chessboard of {columns}x{rows} inner corners detected, {board} expected: check its"
-        " columns and rows"
+    return DetectionError(
+        f"a chessboard of {columns}x{rows} inner corners detected, {board} expected",
+        "check its columns and rows",
     )
 
 
@@ -257,8 +260,8 @@ def _is_first_square_dark(image: np.ndarray, grid: Floats) -> bool:
     if good < colours.size:
         raise DetectionError(
             f"at {colours.size - good} of {colours.size} corners no dark and bright squares"
-            " alternate: move the board so that all of it is in view, uncovered and without"
-            " reflections"
+            " alternate",
+            "move the board so that all of it is in view, uncovered and without reflections",
         )
     return bool(colours[0, 0] > 0)
 
@@ -278,7 +281,8 @@ def _refuse_larger(board: Board, image: np.ndarray, grid: Floats) -> None:
         ):
             raise DetectionError(
                 f"the chessboard goes on beyond the {board.columns}x{board.rows} inner corners of"
-                f" {board}: check the board's columns and rows"
+                f" {board}",
+                "check the board's columns and rows",
             )
 
 

@@ -67,11 +67,12 @@ def _check_detection(board: Board, pixels: np.ndarray, ids: np.ndarray) -> Detec
     if not is_valid or len(np.intersect1d(ids, np.arange(known))) < len(ids):
         raise DetectionError(
             f"the plugin of {board.kind} boards returned features that are not distinct, or not"
-            f" among the {known} of the board: report it to its maker"
+            f" among the {known} of the board",
+            "report it to its maker",
         )
     if len(ids) < _FEWEST:
         raise DetectionError(
-            f"{len(ids)} of {known} features were detected: show the whole board, evenly lit"
+            f"{len(ids)} of {known} features were detected", "show the whole board, evenly lit"
         )
     return Detection(pixels, ids.astype(int))
 
@@ -84,7 +85,7 @@ def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> Ma
     """
     if len(detection.ids) < 4:
         raise InputError(
-            f"{len(detection.ids)} features do not give a board's outline: detect at least 4"
+            f"{len(detection.ids)} features do not give a board's outline", "detect at least 4"
         )
     H = fit_homography(board.points[detection.ids][:, :2], detection.pixels)
     corners = to_image(H, board.outline()[:, :2])

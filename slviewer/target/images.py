@@ -11,10 +11,11 @@ from slviewer.fringe.layout import image_white
 from slviewer.geometry.rigid import Floats, Floats32
 
 MIRRORED = (
-    "the camera's image of the board is a mirror image: switch off the camera's mirror (selfie) or"
-    " flip mode, or mirror its images back, and show the board directly, not in a mirror or from"
-    " behind"
+    "the camera's image of the board is a mirror image",
+    "switch off the camera's mirror (selfie) or flip mode, or mirror its images back, and show the"
+    " board directly, not in a mirror or from behind",
 )
+"""Observation and remedy."""
 SEARCH_PX = 1600
 """Longest side of the downscaled image for the first search; features are measured in the full
 image."""
@@ -39,9 +40,9 @@ class BoardImage:
         flat = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
         if image.dtype not in (np.uint8, np.uint16) or not flat or min(image.shape[:2]) < 32:
             raise InputError(
-                f"an image of shape {image.shape} and type {image.dtype} was given: boards are"
-                " detected in (h, w) or (h, w, 3) images of uint8 or uint16, 32 pixels and more on"
-                " each side"
+                f"an image of shape {image.shape} and type {image.dtype} was given",
+                "boards are detected in (h, w) or (h, w, 3) images of uint8 or uint16, 32 pixels"
+                " and more on each side",
             )
         if image.ndim == 3:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -46,8 +46,8 @@ def fit_homography(points: Floats, pixels: Floats, robust: bool = False) -> Floa
         H, _ = cv2.findHomography(points, pixels, cv2.LMEDS if robust else 0)
     if H is None or abs(np.linalg.det(H)) < 1e-12:
         raise DetectionError(
-            f"the {len(points)} detected features lie on one line: turn the board towards the"
-            " camera"
+            f"the {len(points)} detected features lie on one line",
+            "turn the board towards the camera",
         )
     return H * np.sign(points.mean(0) @ H[2, :2] + H[2, 2])
 
@@ -143,11 +143,11 @@ def check_grid(board: Board, pixels: Floats, ids: np.ndarray, what: str) -> None
     areas = np.linalg.det(jacobians(fitted.H, points))
     if areas.max() <= 0:
         raise DetectionError(
-            f"the {what} appear mirrored: point the camera at the board, not at a mirror"
+            f"the {what} appear mirrored", "point the camera at the board, not at a mirror"
         )
     pitch = np.sqrt(np.maximum(areas, 1e-9))
     if (lengths(pixels - to_image(fitted.H, points)) > MAX_BEND * pitch).any():
-        raise DetectionError(f"the {what} detected do not lie on a flat grid: {advice}")
+        raise DetectionError(f"the {what} detected do not lie on a flat grid", advice)
     off = lengths(fitted.residuals)
     limit = MAX_GRID_OFFSET_SIGMAS * fitted.sigma_px
     wrong = off > np.clip(
@@ -157,6 +157,7 @@ def check_grid(board: Board, pixels: Floats, ids: np.ndarray, what: str) -> None
         worst = int(np.argmax(off / pitch))
         u, v = pixels[worst]
         raise DetectionError(
-            f"{np.count_nonzero(wrong)} of {len(ids)} {what} do not fit the grid "
-            f"(the worst, at pixel {u:.0f}, {v:.0f}, is {off[worst]:.1f} px off): {advice}"
+            f"{np.count_nonzero(wrong)} of {len(ids)} {what} do not fit the grid (the worst, at"
+            f" pixel {u:.0f}, {v:.0f}, is {off[worst]:.1f} px off)",
+            advice,
         )

@@ -129,19 +129,20 @@ def write_drawing(drawing: Drawing, path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in (".pdf", ".svg"):
         raise InputError(
-            f"a sheet cannot be written as '{path.name}': give a name that ends in .pdf or .svg"
+            f"a sheet cannot be written as '{path.name}'", "give a name that ends in .pdf or .svg"
         )
     if suffix == ".pdf" and max(drawing.width, drawing.height) > LARGEST_PDF_MM:
         raise InputError(
-            f"a page of {drawing.width:.0f}x{drawing.height:.0f} mm is more than a PDF can hold "
-            f"({LARGEST_PDF_MM:.0f} mm): write .svg instead"
+            f"a page of {drawing.width:.0f}x{drawing.height:.0f} mm is more than a PDF can hold"
+            f" ({LARGEST_PDF_MM:.0f} mm)",
+            "write .svg instead",
         )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(drawing.pdf() if suffix == ".pdf" else drawing.svg())
     except OSError as error:
         raise InputError(
-            f"'{path}' cannot be written ({error.strerror}): choose another place"
+            f"'{path}' cannot be written ({error.strerror})", "choose another place"
         ) from error
 
 
@@ -149,12 +150,12 @@ def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
     """Draw a board on its page, with a footer; ``margin_mm`` as in ``write_sheet``."""
     if board.plugin_type:
         raise InputError(
-            f"{board.kind} boards come from a plugin and cannot be drawn: print its maker's file"
+            f"{board.kind} boards come from a plugin and cannot be drawn", "print its maker's file"
         )
     if board.pitch_y_mm != board.pitch_mm:
         raise InputError(
-            f"Cannot draw {board}: two pitches describe a print as it was measured. Draw it with"
-            " one pitch."
+            f"Cannot draw {board}",
+            "two pitches describe a print as it was measured. Draw it with one pitch.",
         )
     mark = mark_geometry(board)
     radius = CIRCLE_SHARE / 2 * neighbour_distance_mm(board)
@@ -165,7 +166,7 @@ def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
     )
     margin = max(10.0, needed_margin) if margin_mm is None else margin_mm
     if not margin >= 0:
-        raise InputError(f"a margin of {margin} mm is not possible: give 0 or more")
+        raise InputError(f"a margin of {margin} mm is not possible", "give 0 or more")
     beyond = radius if mark else board.pitch_mm
     first = np.array([margin + beyond, margin + beyond])
     extent = np.ptp(board.points[:, :2], axis=0) + 2 * (margin + beyond)

@@ -48,6 +48,7 @@ from slviewer.wizard.snapshot import (
     SessionView,
     Snapshot,
     WorldView,
+    WrittenFile,
 )
 from slviewer.wizard.steps import views
 
@@ -317,7 +318,7 @@ class Engine:
     def _work(
         self,
         title: str,
-        work: Callable[[Job], Findings[Any] | str],
+        work: Callable[[Job], Findings[Any] | WrittenFile | str],
         section: str = "",
         failed: Callable[[BaseException], None] | None = None,
         finish: Callable[[Findings[Any]], None] | None = None,
@@ -334,15 +335,18 @@ class Engine:
                 if text not in stated:
                     self._notices.add("warning", text, section)
 
-        def done(found: Findings[Any] | str) -> None:
+        def done(found: Findings[Any] | WrittenFile | str) -> None:
             """Add what the work found to the notices."""
-            if finish is not None and not isinstance(found, str):
-                finish(found)
+            is_good = True
+            if isinstance(found, Findings):
+                if finish is not None:
+                    finish(found)
+                is_good = all(each.is_good for each in found.values())
             text = found if isinstance(found, str) else found.summary()
-            is_good = isinstance(found, str) or all(each.is_good for each in found.values())
             add_warnings(text)
             if text:
-                self._notices.add("good" if is_good else "warning", text, section)
+                file = found if isinstance(found, WrittenFile) else None
+                self._notices.add("good" if is_good else "warning", text, section, file)
 
         def end_failed(error: BaseException) -> None:
             """Add the warnings, and the failure; a verdict is stated in the section."""

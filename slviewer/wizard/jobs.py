@@ -28,7 +28,7 @@ from typing import Any
 
 from slviewer.errors import Cancelled, SlviewerError, hide_passwords
 from slviewer.wizard.service import Service, log
-from slviewer.wizard.snapshot import JobView, Level, Notice
+from slviewer.wizard.snapshot import JobView, Level, Notice, WrittenFile
 
 MOST_NOTICES = 100
 
@@ -42,9 +42,11 @@ class Notices:
         self._latest: deque[Notice] = deque(maxlen=MOST_NOTICES)
         self._count = 0
 
-    def add(self, level: Level, text: str, section: str = "") -> None:
+    def add(
+        self, level: Level, text: str, section: str = "", file: WrittenFile | None = None
+    ) -> None:
         """Add a notice and log it, without passwords; one of the same text before it is removed.
-        `section`: of the help's page of findings."""
+        `section`: of the help's page of findings; `file`: that it announces."""
         text = hide_passwords(text)
         log.log(logging.getLevelNamesMapping().get(level.upper(), logging.INFO), "%s", text)
         with self._lock:
@@ -53,7 +55,7 @@ class Notices:
             if same is not None:
                 self._latest.remove(same)
             self._latest.append(
-                Notice(self._count, level, text, datetime.now().astimezone(), section)
+                Notice(self._count, level, text, datetime.now().astimezone(), section, file)
             )
         self._changed()
 

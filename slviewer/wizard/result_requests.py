@@ -63,6 +63,7 @@ from slviewer.wizard.engine import request
 from slviewer.wizard.jobs import describe_failure
 from slviewer.wizard.result_views import surface_to_measure
 from slviewer.wizard.session_reader import missing_for_splined
+from slviewer.wizard.snapshot import WrittenFile
 
 TABLE, PLAN = "measurements.csv", Path(OWN_PLAN).name
 MERGING, MEASURING, COMPARING = "Merging", "Measuring", "Comparing with the nominal model"
@@ -186,7 +187,8 @@ class ResultRequests(ChangeRequests):
             finish(found)
             ((number, merged),) = found.items()
             try:
-                words = _export_file(job.part(0.7, 1), "merged-mesh", number, "ply", WATERTIGHT)
+                file = _export_file(job.part(0.7, 1), "merged-mesh", number, "ply", WATERTIGHT)
+                words = file.summary()
             except Cancelled:
                 raise
             except SlviewerError as error:
@@ -419,12 +421,12 @@ class ResultRequests(ChangeRequests):
     def _export_by(self, title: str, name: str, write: Callable[[Job, Path], str]) -> None:
         """Queue the writing of a file into the exports; ``write`` returns words about it."""
 
-        def work(job: Job) -> str:
-            """Write the file; returns a sentence about it."""
+        def work(job: Job) -> WrittenFile:
+            """Write the file."""
             with job.store.staged_export(name) as path:
                 words = write(job, path)
             job.progress(1.0, "written")
-            return f"{name} is ready to download: {words}"
+            return WrittenFile(name, words)
 
         self._work(title, work, "measurements")
 
@@ -437,9 +439,8 @@ def _export_file(
     plan: MeshingPlan | None,
     texture: int | None = None,
     white: str = "",
-) -> str:
-    """Write one file, as `pipeline.export.export` does, or a mesh with a texture; returns a
-    sentence that begins with the file's name."""
+) -> WrittenFile:
+    """Write one file, as `pipeline.export.export` does, or a mesh with a texture."""
     store, file_name = job.store, default_file_name(what, name, file_format)
     options: dict[str, Any] = {
         "plan": plan, "accept_rejected": accepts_rejected(store),
@@ -455,7 +456,7 @@ def _export_file(
         assert made.textured is not None
         words = f"{made.meshed.text().splitlines()[0]}; {made.textured.text()}"
     job.progress(1.0, "exported")
-    return f"{file_name} is ready to download: {words}"
+    return WrittenFile(file_name, words)
 
 
 def _reword(error: BaseException) -> BaseException:

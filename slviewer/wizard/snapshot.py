@@ -51,15 +51,28 @@ class ExposureChange:
 
 
 @dataclass(frozen=True)
+class WrittenFile:
+    """A file that was written into the exports: its `name`, and in `words` what it holds."""
+
+    name: str
+    words: str
+
+    def summary(self) -> str:
+        """Return the notice about the file."""
+        return f"{self.name} is ready to download: {self.words}"
+
+
+@dataclass(frozen=True)
 class Notice:
     """A message for the operator; `number` increases with each. `section`: of the help's page of
-    findings, or none."""
+    findings, or none. `file`: that it announces."""
 
     number: int
     level: Level
     text: str
     time: datetime
     section: str = ""
+    file: WrittenFile | None = None
 
 
 @dataclass(frozen=True)

@@ -184,7 +184,9 @@ def test_status_bits_are_put_into_words(main, hardware, system, at_start, runnin
 
     control = Dlpc350(Status(), "the controller")
     faults = control.list_faults(is_running=False)
-    assert not missing_facts("; ".join(faults), *at_start) and len(faults) == len(at_start)
+    assert not missing_facts(str(control.describe_faults(faults)), *at_start) and len(
+        faults
+    ) == len(at_start)
     with raises(DeviceError, *running) if running else nullcontext():
         control.check_running()
 

@@ -67,12 +67,12 @@ def calibrate_with_diagnosis(
     unfit = _select_unfit_poses(poses, readable)
     fit = [o for o in observations if o.name not in unfit]
     excluded_before = {**(excluded or {}), **unfit}
-    refusal = ""
+    refusal = None
     stereo: StereoModel | None
     try:
         stereo, used = calibrate_centres(fit, projector, str(board), excluded_before, camera=camera)
     except CalibrationRejected as error:
-        refusal = str(error)
+        refusal = error
         stereo, used = _solve_unchecked(fit, projector, board, excluded_before, camera)
     evidence = Evidence(
         board=str(board),

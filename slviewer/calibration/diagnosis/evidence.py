@@ -2,16 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from slviewer.calibration.known_camera import CameraCheck
 from slviewer.calibration.squareness import Squareness
 from slviewer.calibration.stereo import MIN_TILT_SPREAD_DEG
+from slviewer.errors import CalibrationRejected, InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.records.record import from_plain
-from slviewer.records.verdict import Cause, Finding
+from slviewer.records.verdict import Finding
 
 MIN_DEPTH_SHARE = 3e-5
 """Depth errors of a smaller share of the depth do not matter: 18 um at 600 mm, half the Letter
@@ -68,10 +69,10 @@ class AxisEvidence:
 class PoseEvidence:
     """Evidence of one capture of the target.
 
-    ``refused``: why its board or phase could not be read, "" where they could; ``cause``: of the
-    finding where the board contradicts its description or is mirrored. ``grid``: columns
-    and rows of the grid of circles detected where the given board does not fit it. ``findings``:
-    of the examination of its frames. ``displaced``: number of frames by which the white frame is
+    ``refused``: why its board or phase could not be read, "" where they could; ``misfit``: by which
+    the board contradicts its description or is mirrored. ``grid``: columns and rows of the grid of
+    circles detected where the given board does not fit it. ``findings``: of the examination of its
+    frames. ``displaced``: number of frames by which the white frame is
     late (positive) or early. ``moved_px``: motion of the features in the camera between the frames
     of the two axes. ``numbering``: how the features are misnumbered, "" where they are not.
     ``turn`` (2, 2): mean Jacobian of the projector coordinates by camera pixels over the board.
@@ -87,7 +88,7 @@ class PoseEvidence:
     moved_px: float = np.nan
     numbering: str = ""
     turn: tuple[tuple[float, float], tuple[float, float]] | None = None
-    cause: Cause | Literal[""] = ""
+    misfit: Finding | None = None
     upright: bool = False
 
     @classmethod
@@ -140,8 +141,8 @@ class Evidence:
     """Evidence of a calibration: of each pose and of the solution.
 
     ``board``: its notation. ``excluded``: poses excluded before the fit, with the reason.
-    ``refusal``: why no calibration could be made, or why it was rejected; "" otherwise.
-    ``contradiction``: why the sequence's description cannot be true, or "". ``tilt_spread_deg``:
+    ``refusal``: why no calibration could be made, or why it was rejected. ``contradiction``: why
+    the sequence's description cannot be true. ``tilt_spread_deg``:
     the largest angle between two boards, estimated with a nominal lens. ``camera``: of a camera
     that is fixed, how the poses agree with it.
     """
@@ -150,8 +151,8 @@ class Evidence:
     projector: tuple[int, int]
     poses: tuple[PoseEvidence, ...]
     excluded: Mapping[str, str] = field(default_factory=dict)
-    refusal: str = ""
-    contradiction: str = ""
+    refusal: CalibrationRejected | None = None
+    contradiction: InputError | None = None
     tilt_spread_deg: float = np.nan
     solution: SolutionEvidence | None = None
     is_camera_fixed: bool = False

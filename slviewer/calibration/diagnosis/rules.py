@@ -234,11 +234,9 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
     Evidence is the phase at the Gray code's edges, or the projector's aspect ratio by the
     calibration.
     """
-    if e.contradiction:
-        sentence, _, remedy = e.contradiction.partition(": ")
-        yield Finding(
-            "fringe-period", "rejected", sentence, remedy or "correct the sequence's description"
-        )
+    if error := e.contradiction:
+        remedy = error.remedy or "correct the sequence's description"
+        yield Finding("fringe-period", "rejected", error.located_observation, remedy)
         return
     # the code is of another axis or from its other end, or gamma moves the phase at which it starts
     if any(diagnose_mirroring(e)) or _list_aliased_gamma_poses(e):
@@ -314,14 +312,14 @@ def diagnose_description(e: Evidence) -> Iterator[Finding]:
 def diagnose_refused_boards(e: Evidence) -> Iterator[Finding]:
     """Yield a finding where most poses show a board that contradicts its description, or its mirror
     image."""
-    causes = Counter(pose.cause for pose in e.poses if pose.cause)
-    for cause, count in causes.items():
+    misfits = [(pose.name, pose.misfit) for pose in e.poses if pose.misfit]
+    for cause, count in Counter(misfit.cause for _, misfit in misfits).items():
         if count <= COMMON_SHARE * len(e.poses):
             continue
-        poses = [pose for pose in e.poses if pose.cause == cause]
-        names = tuple(pose.name for pose in poses)
-        sentence, _, remedy = poses[0].refused.partition(": ")
-        yield Finding(cause, "rejected", f"{format_poses(e, names)} {sentence}", remedy, names)
+        names = tuple(name for name, misfit in misfits if misfit.cause == cause)
+        first = next(misfit for _, misfit in misfits if misfit.cause == cause)
+        sentence = f"{format_poses(e, names)} {first.sentence}"
+        yield replace(first, sentence=sentence, poses=names)
 
 
 def diagnose_board_size(e: Evidence) -> Iterator[Finding]:
@@ -567,10 +565,9 @@ def judge_evidence(evidence: Evidence) -> Verdict:
         findings += [finding for rule in stage for finding in rule(evidence)]
         if any(finding.severity == "rejected" for finding in findings):
             return Verdict.of(findings)
-    if evidence.refusal:
-        sentence, _, remedy = evidence.refusal.partition(": ")
-        remedy = remedy or "capture the poses again, and check each before the next"
-        findings.append(Finding("residuals", "rejected", sentence, remedy))
+    if error := evidence.refusal:
+        remedy = error.remedy or "capture the poses again, and check each before the next"
+        findings.append(Finding("residuals", "rejected", error.observation, remedy))
     return Verdict.of(findings)
 
 

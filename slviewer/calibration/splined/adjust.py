@@ -69,14 +69,15 @@ def gather_data(
         single = sorted({axis for o in observations if len(o.surfaces) < 2 for axis in o.surfaces})
         alone = f"; others hold axis {' or '.join(single)} alone" if single else ""
         raise InputError(
-            f"{len(both)} target poses hold both projector coordinates{alone}: splined compares"
-            f" both, so capture at least {MIN_POSES} poses with the patterns of x and of y"
+            f"{len(both)} target poses hold both projector coordinates{alone}",
+            f"splined compares both, so capture at least {MIN_POSES} poses with the patterns of x"
+            " and of y",
         )
     samples = [o.samples for o in both if o.samples is not None]
     if len(samples) < len(both):
         raise InputError(
-            "these target poses were read without samples of their phase: calibrate from the frames"
-            " again"
+            "these target poses were read without samples of their phase",
+            "calibrate from the frames again",
         )
     boards, pixels = [o.points for o in both], [s.camera for s in samples]
     every = np.concatenate(boards)
@@ -157,14 +158,14 @@ def adjust_bundle(
                 break
         else:
             raise CalibrationRejected(
-                f"the joint adjustment still moves by {moved:.2f} sigma after {MAX_STEPS} steps:"
-                " check the stereo calibration's residuals, exclude poses that stand out, and add"
-                " some that reach into the corners"
+                f"the joint adjustment still moves by {moved:.2f} sigma after {MAX_STEPS} steps",
+                "check the stereo calibration's residuals, exclude poses that stand out, and add"
+                " some that reach into the corners",
             )
         if np.count_nonzero(~is_excluded) < MIN_POSES:
             raise CalibrationRejected(
-                f"{np.count_nonzero(is_excluded)} of {len(names)} poses contradict the others: "
-                "capture the board again without moving it"
+                f"{np.count_nonzero(is_excluded)} of {len(names)} poses contradict the others",
+                "capture the board again without moving it",
             )
         fits = _fit_statistics(
             names, residuals, _sigmas(residuals, noise, sample_sigma, data), data

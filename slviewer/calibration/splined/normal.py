@@ -267,8 +267,8 @@ def factorize(A: Floats) -> Floats:
     factor, failed = scipy.linalg.lapack.dpotrf(A.T, lower=1, clean=0, overwrite_a=1)
     if failed:
         raise CalibrationRejected(
-            "the poses leave the joint adjustment undetermined: capture the board in more positions"
-            " and tilts"
+            "the poses leave the joint adjustment undetermined",
+            "capture the board in more positions and tilts",
         )
     return factor
 

@@ -147,7 +147,7 @@ class BestMotion:
         chosen = np.ones(len(points), bool) if fitted is None else np.asarray(fitted, bool)
         if np.count_nonzero(chosen) < 3:
             raise InputError(
-                f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three"
+                f"{np.count_nonzero(chosen)} points were given", "a rigid motion needs three"
             )
         centre = points[chosen].mean(axis=0)
         arm = max(rms(points[chosen] - centre), 1e-12)

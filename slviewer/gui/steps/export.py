@@ -372,10 +372,8 @@ class ExportPanel(StepPanel):
     def _result_text(self, export: ExportView) -> str:
         """Return the notice about this file, without its name; empty where it is no longer among
         the notices."""
-        for notice in reversed(self.snapshot.notices):
-            if notice.text.startswith(f"{export.name} is ready"):
-                return notice.text.partition(": ")[2]
-        return ""
+        files = (notice.file for notice in reversed(self.snapshot.notices))
+        return next((file.words for file in files if file and file.name == export.name), "")
 
     def _link_html(self, export: ExportView | None) -> str:
         """Return a link to an existing file; empty where there is none."""
