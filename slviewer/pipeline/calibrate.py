@@ -444,7 +444,9 @@ def _fit_models(
     if "pixelwise" in models:
         share = 0.33 if "splined" in models else 1.0
         if few and len(observations) < MIN_POSES and len(models) > 1:
-            more = replace(few, sentence=f"{few.sentence}; no pixel-wise model")
+            more = msgspec.structs.replace(
+                few, observation=f"{few.observation}; no pixel-wise model"
+            )
             others = [each for each in verdict.findings if each is not few]
             verdict = Verdict.of([more, *others])
         else:
@@ -474,7 +476,7 @@ def _warn_of_doubts(
     if diagnosed.warning:
         warn(diagnosed.warning)
     doubts = [each for each in diagnosed.verdict.findings if each.severity == "doubtful"]
-    stated = {name for each in doubts for name in each.poses if name in each.sentence}
+    stated = {name for each in doubts for name in each.poses if name in each.observation}
     _warn_of_excluded(stereo.excluded, stated.union(excluded), warn)
 
 

@@ -173,7 +173,7 @@ def raise_rejected(name: str, examination: Examination) -> None:
     """Raise InputError where the examination of a capture rejects it."""
     if examination.rejected:
         *others, last = examination.rejected
-        observation = "; ".join([*(f.text() for f in others), last.sentence])
+        observation = "; ".join([*(f.text() for f in others), last.observation])
         raise InputError(observation, last.remedy, name)
 
 
@@ -203,7 +203,7 @@ def check_capture(
             )
             if fault == CONTRADICT and examination.findings:
                 *others, last = examination.findings
-                fault = "; ".join([CONTRADICT, *(f.text() for f in others), last.sentence])
+                fault = "; ".join([CONTRADICT, *(f.text() for f in others), last.observation])
                 remedy = last.remedy
             raise InputError(
                 f"{decoded} of {illuminated} illuminated pixels"
@@ -215,7 +215,7 @@ def check_capture(
         if unexplained := estimate_frame_light(sequence, frames).unexplained:
             disturbance = describe_disturbance(unexplained)
             raise InputError(
-                f"no pixel carries a readable {axis} pattern: {disturbance.sentence}",
+                f"no pixel carries a readable {axis} pattern: {disturbance.observation}",
                 disturbance.remedy,
                 name,
             )

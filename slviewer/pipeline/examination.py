@@ -3,10 +3,12 @@ whether they are too bright or too dark; and the results of the checks of a rig 
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import structs
 
 from slviewer.examination.examine import examine
 from slviewer.examination.light import Look
@@ -32,17 +34,17 @@ CheckName = Literal[
 _WORST_FIRST: tuple[CheckVerdict, ...] = ("bad", "warning", "good")
 
 
-@dataclass(frozen=True)
-class Check:
-    """The result of one check: the finding in a ``sentence``; the ``remedy``, empty where none is
-    needed; and the ``figures`` that it is based on, whose names contain their units.
+class Check(msgspec.Struct, frozen=True, rename={"observation": "sentence"}):
+    """The result of one check: the ``observation``; the ``remedy``, empty where none is needed; and
+    the ``figures`` that they are based on, whose names contain their units. Both are whole
+    sentences; JSON has the observation as "sentence".
     """
 
     name: CheckName
     verdict: CheckVerdict
-    sentence: str
-    remedy: str
-    figures: dict[str, Any]
+    observation: str
+    remedy: str = ""
+    figures: dict[str, Any] = {}
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Preflight:
             other = others.get(check.name, check)
             pair = Preflight((check, other), None, None, None, 0.0)
             if other.verdict == pair.verdict != check.verdict:
-                check = replace(other, sentence=f"Second camera: {other.sentence}")
+                check = structs.replace(other, observation=f"Second camera: {other.observation}")
             joined.append(check)
         settle = self.settle_ms, second.settle_ms
         exposure = self.exposure_ms, second.exposure_ms
@@ -110,7 +112,7 @@ class Preflight:
         """Each check with its remedy, then what to set."""
         lines = []
         for check in self.checks:
-            lines.append(f"{check.verdict:<8} {check.name}: {check.sentence}")
+            lines.append(f"{check.verdict:<8} {check.name}: {check.observation}")
             if check.remedy:
                 lines.append(f"         -> {check.remedy}")
         if self.settle_ms is not None:
@@ -175,7 +177,7 @@ def warn_of_exposure(
     dark."""
     exposure = check_capture_exposure(sequence, frames, phases)
     if exposure.verdict != "good":
-        warn(f"{name}: {exposure.sentence} {exposure.remedy}")
+        warn(f"{name}: {exposure.observation} {exposure.remedy}")
 
 
 VERSION = 10
@@ -211,7 +213,7 @@ def examine_frames(
     `name_frames`. ``look`` at the frames: taken if None."""
     examination = examine(sequence, stack, look)
     named = [
-        replace(finding, sentence=name_frames(finding.sentence, sequence, files))
+        structs.replace(finding, observation=name_frames(finding.observation, sequence, files))
         for finding in examination.findings
     ]
     return Examination(tuple(named), examination.light_rms)

@@ -46,7 +46,7 @@ def judge_imported(store: Session) -> Verdict | None:
     contradicting = [each for each in checks if each.answer == "disagrees"]
     if not agreeing and contradicting:
         last = contradicting[-1]
-        return Verdict.of([Finding("transform", "rejected", last.sentence, last.remedy)])
+        return Verdict.of([Finding("transform", "rejected", last.observation, last.remedy)])
     file, baseline = Path(meta["source"]).name, np.linalg.norm(meta["imported"]["T"])
     if not agreeing:
         sentence = (

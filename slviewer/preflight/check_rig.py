@@ -156,7 +156,7 @@ def _check_camera(rig: Rig, say: Warn, report: Progress, clock: Clock) -> Prefli
         """Store the checks, and report each with its remedy."""
         for check in results:
             checks.append(check)
-            say(check.sentence if not check.remedy else f"{check.sentence} {check.remedy}")
+            say(check.observation if not check.remedy else f"{check.observation} {check.remedy}")
 
     bench = RigUnderTest(replace(rig, bursts=False), tick, clock)
     bench.measure_references()

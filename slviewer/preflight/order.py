@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import BurstProjector, stated_full_scale
@@ -40,7 +41,7 @@ def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
     )
     order = judge_order(sequence, examine(sequence, stack))
     if order.verdict != "good":
-        order = replace(order, remedy=_REMEDY)
+        order = structs.replace(order, remedy=_REMEDY)
     return order, check_repeats(sequence, stack)
 
 
@@ -56,7 +57,7 @@ def judge_order(sequence: PatternSequence, examination: Examination) -> Check:
         return Check("order", "good", f"All {n} frames are in order.", "", figures)
     if found[0].cause == "frame-lag" and found[0].value:
         figures["lag"] = int(found[0].value)
-    findings = "; ".join(dict.fromkeys(f.sentence for f in found[:3]))
+    findings = "; ".join(dict.fromkeys(f.observation for f in found[:3]))
     remedy = format_sentence(found[0].remedy)
     is_rejected = any(f.severity == "rejected" for f in found)
     verdict: CheckVerdict = "bad" if is_rejected else "warning"

@@ -2,10 +2,10 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic, measure_second_harmonic
 from slviewer.errors import InputError
@@ -95,7 +95,9 @@ def _check_frames(capture: Capture, progress: Progress) -> Preflight:
     checks = (
         description,
         *compared,
-        replace(repeats, sentence=name_frames(repeats.sentence, sequence, capture.files)),
+        structs.replace(
+            repeats, observation=name_frames(repeats.observation, sequence, capture.files)
+        ),
         check_capture_exposure(sequence, frames, phases),
         _check_response(sequence, frames, examination),
         _check_noise(sequence, frames, phases),
@@ -113,7 +115,7 @@ def _check_description(examination: Examination, error: InputError | None = None
     if found:
         verdict: CheckVerdict = "bad" if examination.rejected else "warning"
         remedy = "; ".join(dict.fromkeys(f.remedy for f in found))
-        sentence = _join_findings([f.sentence for f in found])
+        sentence = _join_findings([f.observation for f in found])
         return Check("description", verdict, sentence, format_sentence(remedy), {})
     if error:
         sentence = format_sentence(error.located_observation)
@@ -247,7 +249,7 @@ def _check_decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
 
 def _list_sentences(examination: Examination, *causes: Cause) -> list[str]:
     """List the observations of the findings of these causes."""
-    return [f.sentence for f in examination.findings if f.cause in causes]
+    return [f.observation for f in examination.findings if f.cause in causes]
 
 
 def _join_findings(findings: Sequence[str]) -> str:

@@ -434,7 +434,7 @@ class TransformCheck(Record, frozen=True, kw_only=True):
         return self.summary() if self.answer == "disagrees" else ""
 
     @property
-    def sentence(self) -> str:
+    def observation(self) -> str:
         """The answer and what it rests on."""
         of = f"R and T of the imported calibration, by its {self.evidence}"
         if self.answer == "undecided":
@@ -450,7 +450,7 @@ class TransformCheck(Record, frozen=True, kw_only=True):
 
     def summary(self) -> str:
         """Return the answer, what it rests on, and what to do."""
-        return f"{self.sentence}: {self.remedy}" if self.remedy else self.sentence
+        return f"{self.observation}: {self.remedy}" if self.remedy else self.observation
 
     def list_tables(self, name: str) -> list[Table]:
         """Return the answer, or the misfit of each direction where these were compared."""

@@ -2,10 +2,10 @@
 frames; and the verdict on a calibration: good, doubtful or rejected."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import msgspec
+from msgspec import structs
 
 Level = Literal["good", "doubtful", "rejected"]
 Severity = Literal["note", "doubtful", "rejected"]
@@ -50,17 +50,17 @@ CAUSES: tuple[Cause, ...] = get_args(Cause)
 """From root causes to their consequences: a finding may explain those of later causes."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A detected fault: its cause and severity, the observation (``sentence``), the ``remedy``, and
-    where it is: the poses, or the frames of one capture, counted from 0, and the axis.
+class Finding(msgspec.Struct, frozen=True, rename={"observation": "sentence"}):
+    """A detected fault: its cause and severity, the ``observation``, the ``remedy``, and where it
+    is: the poses, or the frames of one capture, counted from 0, and the axis.
 
-    ``value``: what fits instead of a described value, in the unit of the sentence.
+    ``value``: what fits instead of a described value, in the unit of the observation. JSON has the
+    observation as "sentence".
     """
 
     cause: Cause
     severity: Severity
-    sentence: str
+    observation: str
     remedy: str
     poses: tuple[str, ...] = ()
     frames: tuple[int, ...] = ()
@@ -69,7 +69,7 @@ class Finding:
 
     def text(self) -> str:
         """Return observation and remedy in one line."""
-        return f"{self.sentence}: {self.remedy}"
+        return f"{self.observation}: {self.remedy}"
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -81,7 +81,7 @@ class Verdict(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         worst = self.findings[0].severity if self.findings else "note"
-        msgspec.structs.force_setattr(self, "level", "good" if worst == "note" else worst)
+        structs.force_setattr(self, "level", "good" if worst == "note" else worst)
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":
@@ -94,7 +94,7 @@ class Verdict(msgspec.Struct, frozen=True):
         return cls(tuple(ranked))
 
     def rename(self, words: Mapping[str, str]) -> "Verdict":
-        """Return the verdict with other words for devices in its sentences and remedies."""
+        """Return the verdict with other words for devices in its observations and remedies."""
 
         def renamed(text: str) -> str:
             """Return a text with the words replaced."""
@@ -104,7 +104,9 @@ class Verdict(msgspec.Struct, frozen=True):
 
         return Verdict(
             tuple(
-                replace(each, sentence=renamed(each.sentence), remedy=renamed(each.remedy))
+                structs.replace(
+                    each, observation=renamed(each.observation), remedy=renamed(each.remedy)
+                )
                 for each in self.findings
             )
         )

@@ -495,7 +495,7 @@ def _verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
         is_corrected = finding.severity == "note"
         what = "Already corrected." if is_corrected else f"What to do: {finding.remedy}."
         items.append(
-            PageNotice(f"{finding.sentence}. {what}", "plain" if is_corrected else "warning")
+            PageNotice(f"{finding.observation}. {what}", "plain" if is_corrected else "warning")
         )
     text = (
         ""

@@ -97,7 +97,7 @@ def test_cells_that_are_not_square_are_named() -> None:
     assert found.verdict.causes[0] == "board-size" and found.verdict.level != "good"
     squareness = found.evidence.solution.squareness
     assert 0.698 < squareness.explaining < 0.702
-    assert f"{squareness.explaining:.4f}" in found.verdict.findings[0].sentence
+    assert f"{squareness.explaining:.4f}" in found.verdict.findings[0].observation
     assert "fringe-period" not in found.verdict.causes
 
 
@@ -176,7 +176,7 @@ def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> Non
     found = attempt(bent)
     assert found.verdict.level == "rejected" and found.verdict.causes[0] == "residuals"
     assert found.stereo is not None and found.stereo.reprojection_rms_px["stereo"] > 2
-    assert missing_facts(found.verdict.findings[0].sentence, "reprojection error") == []
+    assert missing_facts(found.verdict.findings[0].observation, "reprojection error") == []
     exchanged = [dataclasses.replace(o, projector=o.projector[:, ::-1]) for o in observations(6)]
     evidence = [PoseEvidence(o.name, turn=fit_mean_turn(o.camera, o.projector)) for o in exchanged]
     found = calibrate_with_diagnosis(exchanged, evidence, PROJECTOR, BOARD)

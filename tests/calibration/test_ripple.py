@@ -94,7 +94,7 @@ def ripple(rms_px: float, waves: int, noise_px: float = 0.1) -> Ripple:
 def test_as_many_waves_as_steps_are_gamma_and_few_are_changing_light(solution) -> None:
     (found,) = diagnose_ripple(evidence(solution, {"x": ripple(0.4, 3)}, 3))
     assert (found.cause, found.severity) == ("gamma", "doubtful")
-    assert not missing_facts(found.sentence, 3, "0.40 px", "0.640 mm", "0.10 px", "0.160 mm")
+    assert not missing_facts(found.observation, 3, "0.40 px", "0.640 mm", "0.10 px", "0.160 mm")
     (found,) = diagnose_ripple(evidence(solution, {"x": ripple(0.4, 1)}, 8))
     assert (found.cause, found.severity) == ("residuals", "doubtful") and "exposure" in found.text()
 
@@ -167,5 +167,5 @@ def test_residuals_beyond_noise_are_doubtful_and_never_good() -> None:
         and "in y, 0.3" in verdict.reason
     )
     gamma = Verdict((Finding("gamma", "doubtful", "bent", "straighten"),))
-    assert "probable cause: gamma" in judge_splined(gamma, scattered).findings[1].sentence
+    assert "probable cause: gamma" in judge_splined(gamma, scattered).findings[1].observation
     assert judge_splined(Verdict(), Noise(0.01, (2.4, 2.4), (2.401, 2.401))).level == "rejected"

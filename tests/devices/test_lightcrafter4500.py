@@ -386,10 +386,10 @@ def test_the_preflight_times_both_modes_and_names_a_lost_trigger(lightcrafter):
     # 25 patterns on 13 pictures, and two white ones
     assert check.figures["burst_s"] == pytest.approx(15 * 2 * 8.333e-3, abs=1e-3)
     assert check.figures["frames"] == 25 and check.figures["misplaced_frames"] == []
-    assert not missing_facts(check.sentence, 25, "0.25")
+    assert not missing_facts(check.observation, 25, "0.25")
     controller.fault = "trigger lost"
     lost = preflight(rig, clock=clock).check("burst")
-    assert lost.verdict == "bad" and not missing_facts(lost.sentence, "trigger", 30)
+    assert lost.verdict == "bad" and not missing_facts(lost.observation, "trigger", 30)
 
 
 @pytest.mark.computes

@@ -148,7 +148,7 @@ def test_exchanged_frames_are_named(name: str, frame: int) -> None:
     order[frame], order[frame + 1] = frame + 1, frame
     finding = root(sequence, frames[order])
     assert (finding.cause, finding.frames) == ("frame-order", (frame, frame + 1))
-    assert not missing_facts(finding.sentence, frame + 1, frame + 2)  # counted from 1
+    assert not missing_facts(finding.observation, frame + 1, frame + 2)  # counted from 1
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_a_repeated_image_is_named(name: str, frame: int) -> None:
     repeated[frame] = frames[frame - 1]
     found = examine(sequence, repeated).rejected
     assert [(f.cause, f.frames) for f in found] == [("duplicate-frame", (frame,))]
-    assert not missing_facts(found[0].sentence, frame + 1)
+    assert not missing_facts(found[0].observation, frame + 1)
 
 
 @pytest.mark.slow
@@ -217,7 +217,7 @@ def test_inverses_taken_for_patterns_are_named(name: str) -> None:
         frames[pattern + inverse] = frames[inverse + pattern]
     found = examine(sequence, frames).rejected
     assert [(f.cause, f.axis) for f in found] == [("bit-order", "x"), ("bit-order", "y")]
-    assert not any(missing_facts(f.sentence, "inverses") for f in found)
+    assert not any(missing_facts(f.observation, "inverses") for f in found)
 
 
 @pytest.mark.parametrize("name", variants(SEQUENCES, "three"))
@@ -392,7 +392,7 @@ def test_frames_without_a_pattern_are_named(
     found = examine(sequence, spoil(frames)).findings
     assert [f.cause for f in found] == [cause]
     share = "100 %" if cause == "saturation" else "0.0 %"
-    assert not missing_facts(found[0].sentence, share)
+    assert not missing_facts(found[0].observation, share)
 
 
 def test_a_dim_wall_does_not_decide() -> None:

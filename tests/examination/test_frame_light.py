@@ -69,7 +69,7 @@ def test_gains_are_those_that_were_applied(name):
     ratio = light.gain[steps] / gain[steps, 0, 0]
     assert ratio.std() / ratio.mean() < 0.004
     (found,) = describe_light(sequence, light)
-    assert found.cause == "exposure-drift" and not missing_facts(found.sentence, "corrected")
+    assert found.cause == "exposure-drift" and not missing_facts(found.observation, "corrected")
 
 
 BEATS = PatternSequence(
@@ -89,7 +89,7 @@ def test_a_small_drift_is_known_by_the_steps_of_all_periods(change):
     assert rms_px(decoding.decode(BEATS, drifting, "x")) > 1.2 * floor
     assert 0.8 * floor < rms_px(decode(BEATS, drifting, "x")) < 1.1 * floor
     (found,) = describe_light(BEATS, light)
-    assert found.cause == "exposure-drift" and not missing_facts(found.sentence, "corrected")
+    assert found.cause == "exposure-drift" and not missing_facts(found.observation, "corrected")
 
 
 def test_gains_that_differ_at_random_are_no_drift():

@@ -52,7 +52,7 @@ def test_a_ghost_is_named_with_its_share():
     (found,) = examine(SEQUENCE, exposed("crosstalk", "severe")).findings
     assert found.cause == "ghosting" and found.severity == "doubtful"
     share = 100 * has_ghost(*evaluated("crosstalk", "severe"))
-    assert not missing_facts(found.sentence, f"{share:.0f} %")
+    assert not missing_facts(found.observation, f"{share:.0f} %")
 
 
 OTHERS = [

@@ -105,7 +105,7 @@ def test_a_repeated_image_is_named(real_data: Path, name: str, frame: int) -> No
     repeated[frame] = frames[frame - 1]
     (found,) = examine(sequence, repeated).rejected
     assert (found.cause, found.frames) == ("duplicate-frame", (frame,))
-    assert not missing_facts(found.sentence, f"frame {frame + 1}")
+    assert not missing_facts(found.observation, f"frame {frame + 1}")
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_gamma_is_corrected_and_reported(monkeypatch, steps, gamma, times):
     assert share_within(phase, TRUTH) > 0.97 > 0.95 > share_within(before, TRUTH)
     assert phase.mask.mean() > 0.97
     [suspect] = gamma_suspects(sequence, stack)
-    assert not missing_facts(suspect.sentence, f"{steps} phase steps", "gamma")
+    assert not missing_facts(suspect.observation, f"{steps} phase steps", "gamma")
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ def test_a_sound_rig_is_left_in_peace(seed, looked, compiled):
     # of the processor, whatever else it does
     assert found.seconds > 0 and process_time() - before < 10
     assert len(said) == len(found.checks) == 10 and done == sorted(done) and done[-1] == 1.0
-    assert all(check.sentence.endswith(".") for check in found.checks)
+    assert all(check.observation.endswith(".") for check in found.checks)
     assert found.to_json()["checks"][0]["name"] == "screen"
     table = np.array(found.levels)
     assert np.abs(table - np.arange(256)).max() <= 2
@@ -147,7 +147,7 @@ def test_a_camera_that_is_behind_is_named(images, looked, lying):
 def test_frames_out_of_order_are_named(wrong, names, facts, looked, lying):
     found = looked(lying(**wrong))
     assert wrong_with(found) == names and found.verdict == "bad"
-    assert not missing_facts(found.check("order").sentence, *facts)
+    assert not missing_facts(found.check("order").observation, *facts)
 
 
 def test_another_screen_is_named(looked, lying):
@@ -182,7 +182,7 @@ def test_a_wrong_exposure_is_named_with_a_better_one(exposure_ms, verdict, time)
 def test_mains_light_is_named_with_its_frequency(hertz, exposure, looked, lying):
     found = looked(lying(room=25, mains_depth=0.4, mains_hz=hertz))
     flicker = found.check("flicker")
-    assert flicker.verdict == "bad" and not missing_facts(flicker.sentence, "room's")
+    assert flicker.verdict == "bad" and not missing_facts(flicker.observation, "room's")
     assert not missing_facts(flicker.remedy, exposure)
     assert flicker.figures["mains_hz"] in (None, int(hertz))
     assert wrong_with(found) <= {"flicker", "exposure", "ambient"}
@@ -203,7 +203,7 @@ def test_a_lamp_switched_on_meanwhile_is_named(looked, time):
 
     found = looked(rig, say=switch)
     assert "ambient" in wrong_with(found) and not missing_facts(
-        found.check("ambient").sentence, "brighter"
+        found.check("ambient").observation, "brighter"
     )
     assert "motion" not in wrong_with(found)
 
@@ -293,5 +293,5 @@ def test_a_second_camera_is_checked_too(looked, lying, time, compiled):
     found = looked(replace(pair, second=late.camera, projector=late.projector), say=said.append)
     assert wrong_with(found) == {"latency", "order"}
     assert found.check("order").figures["lag"] == 1
-    assert all("Second camera" in found.check(name).sentence for name in ("latency", "order"))
+    assert all("Second camera" in found.check(name).observation for name in ("latency", "order"))
     assert sum("Second camera" in each for each in said) == len(said) / 2

@@ -181,4 +181,4 @@ def test_the_frames_of_a_second_camera_are_checked_too(tmp_path: Path) -> None:
     with Session.create(tmp_path / "session") as store:
         store.save_capture("part", "scan", sequence, stack, second=late)
     order = check_recorded_rig(tmp_path / "session", "part").check("order")
-    assert order.verdict == "bad" and "Second camera" in order.sentence
+    assert order.verdict == "bad" and "Second camera" in order.observation

@@ -37,7 +37,7 @@ def test_a_scene_without_contrast_proves_nothing(noise: float) -> None:
     shaded = EVEN + np.linspace(-30, 30, 160)
     for scene in (EVEN, shaded):
         motion = check(scene, noise=noise)
-        assert motion.verdict == "unknown" and not missing_facts(motion.sentence, "contrast")
+        assert motion.verdict == "unknown" and not missing_facts(motion.observation, "contrast")
         assert not missing_facts(motion.remedy, "board")
 
 

@@ -80,7 +80,8 @@ def examine_capture(sequence: PatternSequence, stack: np.ndarray) -> list[Named]
     """What the program finds in a capture (n, h, w): the worst first, else in its own order."""
     examination = examine_frames(sequence, stack)
     found = [
-        Named(f.cause, f.frames, _SEVERITIES[f.severity], f.sentence) for f in examination.findings
+        Named(f.cause, f.frames, _SEVERITIES[f.severity], f.observation)
+        for f in examination.findings
     ]
     if examination.rejected:
         return found
@@ -92,9 +93,9 @@ def examine_capture(sequence: PatternSequence, stack: np.ndarray) -> list[Named]
         return [Named(next(causes, "unreadable"), (), "bad", str(error)), *found]
     exposure = check_capture_exposure(sequence, stack, phases)
     if exposure.verdict in ("bad", "warning"):
-        cause = "saturation" if "saturated." in exposure.sentence else "dark"
+        cause = "saturation" if "saturated." in exposure.observation else "dark"
         severity: Severity = "bad" if exposure.verdict == "bad" else "warning"
-        found.append(Named(cause, (), severity, exposure.sentence))
+        found.append(Named(cause, (), severity, exposure.observation))
     order = list(_SEVERITIES.values())
     return sorted(found, key=lambda named: order.index(named.severity))
 

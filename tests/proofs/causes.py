@@ -343,7 +343,7 @@ def prove_causes(scale: float, seed: int, progress: Progress) -> Proof:
         record.append({
             "fault": name, "cause": cause, "causes": list(verdict.causes), "level": verdict.level,
             "reason": verdict.reason,
-            "findings": [finding.sentence for finding in verdict.findings],
+            "findings": [finding.observation for finding in verdict.findings],
         })  # fmt: skip
     right = sum(row["right"] == "yes" for row in rows)
     line = f"{right} of {len(rows)} named rightly, at scale {scale:g}"

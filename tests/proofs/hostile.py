@@ -292,7 +292,7 @@ class HostileBench:
                 for name, frames in captures.items()
                 if (about := [message for message in messages if name in message])
                 for finding in examine(self.sequence, frames).findings
-                if any(finding.sentence in message for message in about)
+                if any(finding.observation in message for message in about)
             ]
 
     def _measure(self, run: CaseRun, name: str, truth: tuple[Renderer, Renderer]) -> MeasuredScan:

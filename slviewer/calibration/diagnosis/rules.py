@@ -8,9 +8,9 @@ stages after a rejecting finding are not run, as their findings could be its con
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
 
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic
@@ -118,7 +118,7 @@ def classify_frame_order(pose: PoseEvidence) -> tuple[Cause, str] | None:
     for finding in pose.findings:
         cause: Cause = "frame-order" if finding.cause == "duplicate-frame" else finding.cause
         if cause in ORDERS:
-            return cause, finding.sentence
+            return cause, finding.observation
     # the white frame, which decoding does not need
     if pose.displaced:
         cause = "frame-lag" if pose.displaced > 0 else "missing-frame"
@@ -301,10 +301,10 @@ def diagnose_description(e: Evidence) -> Iterator[Finding]:
             continue
         names = tuple(name for name, finding in first.items() if finding.cause == cause)
         shown = first[names[0]]
-        yield replace(
+        yield structs.replace(
             shown,
             severity=rate_severity(e, names, is_excluded=True),
-            sentence=f"{format_poses(e, names)} {shown.sentence}",
+            observation=f"{format_poses(e, names)} {shown.observation}",
             poses=names,
         )
 
@@ -318,8 +318,8 @@ def diagnose_refused_boards(e: Evidence) -> Iterator[Finding]:
             continue
         names = tuple(name for name, misfit in misfits if misfit.cause == cause)
         first = next(misfit for _, misfit in misfits if misfit.cause == cause)
-        sentence = f"{format_poses(e, names)} {first.sentence}"
-        yield replace(first, sentence=sentence, poses=names)
+        sentence = f"{format_poses(e, names)} {first.observation}"
+        yield structs.replace(first, observation=sentence, poses=names)
 
 
 def diagnose_board_size(e: Evidence) -> Iterator[Finding]:

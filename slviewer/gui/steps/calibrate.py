@@ -444,7 +444,7 @@ def exclusions_html(calibration: CalibrationView, verdict: Verdict | None) -> Ht
     text = f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma)"
     outliers = note(f"{text}: shadow or occlusion.")
     findings, excluded = verdict.findings if verdict else (), calibration.stereo.excluded.items()
-    stated = {name for each in findings for name in each.poses if name in each.sentence}
+    stated = {name for each in findings for name in each.poses if name in each.observation}
     lines = [f"{name}: {why}" for name, why in excluded if name not in stated]
     if calibration.splined:
         lines += [
@@ -483,7 +483,7 @@ def model_choice_html(calibration: CalibrationView, compared: ModelComparison | 
 
 def _format_finding(finding: Finding) -> str:
     """Return the HTML of a finding and its remedy."""
-    text, link = to_html(_capitalise(finding.sentence, finding.poses)), help_link(finding.cause)
+    text, link = to_html(_capitalise(finding.observation, finding.poses)), help_link(finding.cause)
     if finding.severity == "note":
         return f'<div style="margin-top:0.5em">{coloured("Corrected:", "dim")} {text}. {link}</div>'
     remedy = coloured(f"{finding.remedy[:1].upper()}{finding.remedy[1:]}.", "plain", bold=True)

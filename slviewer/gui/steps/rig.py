@@ -403,7 +403,7 @@ def checks_table(result: Preflight) -> Html:
         link = "" if check.verdict == "good" else f" {help_link(f'check-{check.name}')}"
         lines.append(
             f'<div style="{_ROW}"><div style="width:1em;text-align:center">{mark}</div>'
-            f'<div style="flex:1"><b>{to_html(check.name)}</b>&ensp;{to_html(check.sentence)}'
+            f'<div style="flex:1"><b>{to_html(check.name)}</b>&ensp;{to_html(check.observation)}'
             f"{link}{remedy}</div></div>"
         )
     return paragraph(Html("".join(lines)))

@@ -116,7 +116,7 @@ def _refocused(workplace: Workplace) -> Outcome:
     truth = 100 * (1 - _FOCAL["camera"] / (1.005 * lens.K[0, 0]))
     verdict, _ = _calibrate(session, file, True)
     named = next((each for each in verdict.findings if each.cause == "camera-file"), None)
-    stated = float(named.sentence.partition("length ")[2].split()[0]) if named else np.nan
+    stated = float(named.observation.partition("length ")[2].split()[0]) if named else np.nan
     after, fit = _calibrate(session, file, False)
     return Outcome(
         f"{verdict.level}: {stated:.2f} % too long; without --fix-camera {after.level},"
@@ -124,7 +124,7 @@ def _refocused(workplace: Workplace) -> Outcome:
         f"{truth:.2f} % too long, {_FOCAL['camera']:.1f} px",
         named is not None
         and verdict.level == "doubtful"
-        and "shorter" in named.sentence
+        and "shorter" in named.observation
         and abs(stated - truth) < 0.1
         and "without --fix-camera" in named.remedy
         and after.level == "good"
