@@ -98,6 +98,11 @@ class PhaseMap:
         denominator of coverage."""
         return self.reason != Reason.DARK
 
+    def share(self, reason: Reason) -> float:
+        """Return the share of the illuminated pixels that have a reason; 0 without any."""
+        reasons = self.reason[self.illuminated]
+        return float(np.mean(reasons == reason)) if reasons.size else 0.0
+
     @property
     def is_relative(self) -> bool:
         """Whether the coordinate is known only modulo ``unambiguous_px``."""

@@ -21,7 +21,12 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.phase_shifting import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.examination import examine_frames, load_examination, load_or_save_examination
+from slviewer.pipeline.examination import (
+    MUCH_CLIPPED,
+    examine_frames,
+    load_examination,
+    load_or_save_examination,
+)
 from slviewer.pipeline.models import load_pair
 from slviewer.pipeline.operation import (
     Progress,
@@ -41,8 +46,6 @@ from slviewer.session.store import Session
 
 T = TypeVar("T")
 Computed = TypeVar("Computed")
-MANY_SATURATED = 0.05
-"""Share of the illuminated pixels: highlights saturate fewer, an exposure that is too long more."""
 NEAR_DARK = 2.0
 """A median modulation within this factor of the least that is decoded: much of the scene lies below
 it."""
@@ -197,9 +200,8 @@ def check_capture(
         if decoded and decoded >= MIN_DECODED * illuminated:
             continue
         if illuminated:
-            reasons = phase.reason[phase.illuminated]
             share, fault, remedy = max(
-                (np.mean(reasons == each), *fault) for each, fault in _FAULTS.items()
+                (phase.share(each), *fault) for each, fault in _FAULTS.items()
             )
             if fault == CONTRADICT and examination.findings:
                 *others, last = examination.findings
@@ -234,11 +236,8 @@ def loss_warnings(
     """Return warnings where saturation or weak fringes mask many pixels of a decoded capture (n, h,
     w)."""
     messages = []
-    reasons = [phase.reason[phase.illuminated] for phase in phases.values()]
-    saturated = max(
-        (float(np.mean(each == Reason.SATURATED)) for each in reasons if each.size), default=0.0
-    )
-    if saturated > MANY_SATURATED:
+    saturated = max((phase.share(Reason.SATURATED) for phase in phases.values()), default=0.0)
+    if saturated > MUCH_CLIPPED:
         white = white_level(sequence, frames, range(len(frames)))
         messages.append(
             f"{100 * saturated:.0f} % of the illuminated pixels are saturated and masked: lower the"
@@ -248,12 +247,8 @@ def loss_warnings(
     for axis, phase in phases.items():
         if not (phase.steps and phase.mask.any()):
             continue
-        modulation, background = (
-            float(np.median(m[phase.mask])) for m in (phase.modulation, phase.background)
-        )
-        white = white_level(sequence, frames, sequence.select(axis))
-        sigmas = dark_sigmas(axis_layout(sequence, axis))
-        (least,) = dark_limit(np.array([background], np.float32), phase.noise, white, sigmas)
+        modulation = float(np.median(phase.modulation[phase.mask]))
+        least = least_modulation(sequence, frames, phase)
         if modulation < NEAR_DARK * least:
             if unexplained := estimate_frame_light(sequence, frames).unexplained:
                 cause = describe_disturbance(unexplained).text()
@@ -267,6 +262,15 @@ def loss_warnings(
             )
             break
     return messages + scatter_warnings(phases)
+
+
+def least_modulation(sequence: PatternSequence, frames: np.ndarray, phase: PhaseMap) -> float:
+    """Return the modulation, grey levels, below which pixels of the median background are
+    masked."""
+    background = np.array([np.median(phase.background[phase.mask])], np.float32)
+    white = white_level(sequence, frames, sequence.select(phase.axis))
+    sigmas = dark_sigmas(axis_layout(sequence, phase.axis))
+    return float(dark_limit(background, phase.noise, white, sigmas)[0])
 
 
 def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:

@@ -46,6 +46,11 @@ class Check(msgspec.Struct, frozen=True, rename={"observation": "sentence"}):
     remedy: str = ""
     figures: dict[str, Any] = {}
 
+    @property
+    def message(self) -> str:
+        """Observation and remedy."""
+        return f"{self.observation} {self.remedy}".rstrip()
+
 
 @dataclass(frozen=True)
 class Preflight:
@@ -123,7 +128,8 @@ class Preflight:
 
 
 CLIPPED, MUCH_CLIPPED = 0.005, 0.05
-"""Shares of the illuminated pixels that are saturated: a warning, and bad."""
+"""Shares of the illuminated pixels that are saturated: a warning, and bad. Highlights saturate
+fewer than the second, an exposure that is too long more."""
 WEAK, TOO_WEAK = 0.4, 0.12
 """Of full scale, that the brightest illuminated pixels should reach: below, a warning, and bad."""
 _BRIGHTER = "Raise the exposure, or open the aperture."
@@ -137,16 +143,13 @@ def check_capture_exposure(
     full = white_level(sequence, frames, range(len(frames)))
     illuminated = np.logical_or.reduce([phase.illuminated for phase in phases.values()])
     if not illuminated.any():
-        return Check("exposure", "bad", "No pixel sees the patterns.", _BRIGHTER, {})
+        return Check("exposure", "bad", "No pixel sees the patterns.", _BRIGHTER)
     rows = select_rows(*frames.shape[1:])
     coded = [i for i, frame in enumerate(sequence.frames) if frame.kind != "texture"]
     brightest = np.max([frames[i][rows] for i in coded], axis=0)
     levels = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()
     share = float(np.quantile(levels, 0.995)) / full
-    clipped = max(
-        float(np.mean(phase.reason[phase.illuminated] == Reason.SATURATED))
-        for phase in phases.values()
-    )
+    clipped = max(phase.share(Reason.SATURATED) for phase in phases.values())
     sentence = f"The brightest of the scene reaches {100 * share:.0f} % of the camera's range"
     verdict: CheckVerdict = "good"
     remedy = ""
@@ -177,7 +180,7 @@ def warn_of_exposure(
     dark."""
     exposure = check_capture_exposure(sequence, frames, phases)
     if exposure.verdict != "good":
-        warn(f"{name}: {exposure.observation} {exposure.remedy}")
+        warn(f"{name}: {exposure.message}")
 
 
 VERSION = 10

@@ -390,10 +390,7 @@ def _centre_code(
     )
     origins[axis] = -0.5 - excess / 2
     centred = replace(sequence, gray_origin_px=PerAxis(**origins))
-    outside = [
-        (phase.reason == Reason.OUTSIDE).sum() / max(1, int(phase.illuminated.sum()))
-        for phase in (decode(each, frames, axis) for each in (sequence, centred))
-    ]
+    outside = [decode(each, frames, axis).share(Reason.OUTSIDE) for each in (sequence, centred)]
     return centred if outside[1] < MAX_OUTSIDE < outside[0] else None
 
 

@@ -1,7 +1,7 @@
 """The preflight without a browser: is a rig fit to capture with, and is a capture fit to measure
 with?"""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -115,8 +115,8 @@ _CHECK_ORDER: tuple[CheckName, ...] = (
 def preflight(
     rig: Rig,
     *,
-    say: Callable[[str], None] | None = None,
-    progress: Progress | None = None,
+    say: Warn = ignore_warnings,
+    progress: Progress = ignore_progress,
     clock: Clock = SYSTEM_CLOCK,
 ) -> Preflight:
     """Check an open rig, on the thread that owns its devices; about 10 s for each of its cameras,
@@ -126,19 +126,17 @@ def preflight(
     where a device does not answer. Patterns are loaded and light is shown; what was loaded and
     shown before is for the caller to restore.
     """
-    report = progress or ignore_progress
     if rig.second is None:
-        return _check_camera(rig, say or ignore_warnings, report, clock)
+        return _check_camera(rig, say, progress, clock)
     alone = replace(rig, second=None, bursts=False)
-    first = _check_camera(alone, say or ignore_warnings, part(report, 0.0, 0.5), clock)
+    first = _check_camera(alone, say, part(progress, 0.0, 0.5), clock)
     other = replace(alone, camera=rig.second, turntable=None)
 
-    def say_of_second(sentence: str) -> None:
+    def say_of_second(text: str) -> None:
         """Report a check of the second camera."""
-        if say is not None:
-            say(f"Second camera: {sentence}")
+        say(f"Second camera: {text}")
 
-    return first.join(_check_camera(other, say_of_second, part(report, 0.5, 1.0), clock))
+    return first.join(_check_camera(other, say_of_second, part(progress, 0.5, 1.0), clock))
 
 
 def _check_camera(rig: Rig, say: Warn, report: Progress, clock: Clock) -> Preflight:
@@ -156,7 +154,7 @@ def _check_camera(rig: Rig, say: Warn, report: Progress, clock: Clock) -> Prefli
         """Store the checks, and report each with its remedy."""
         for check in results:
             checks.append(check)
-            say(check.observation if not check.remedy else f"{check.observation} {check.remedy}")
+            say(check.message)
 
     bench = RigUnderTest(replace(rig, bursts=False), tick, clock)
     bench.measure_references()
@@ -174,7 +172,7 @@ def _check_camera(rig: Rig, say: Warn, report: Progress, clock: Clock) -> Prefli
             " show."
         )
         rest = [name for name in _CHECK_ORDER if name not in {check.name for check in checks}]
-        checks += [Check(name, "unknown", unseen, "", {}) for name in rest]
+        checks += [Check(name, "unknown", unseen) for name in rest]
         return Preflight(tuple(checks), None, None, None, clock.now() - began)
     add(screen, delay)
     right, exposure_ms = check_exposure(bench)

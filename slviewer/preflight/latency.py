@@ -2,22 +2,20 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from slviewer.pipeline.examination import Check, CheckVerdict
+from slviewer.examination.limits import LEAST_LIT
+from slviewer.pipeline.examination import Check
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CHANGE_COUNT = 8
-# share of a change that may be missing from one that has arrived, and under flicker
-_NEAR, _NEAREST = (
-    0.05,
-    0.4,
-)
+_NEAR, _NEAREST = 0.05, 0.4
+"""Share of a change that may be missing from one that has arrived, and under flicker."""
 _TIMEOUT_S = 1.2
 _STALE_TRIALS = 3
 _LONG_MS = 250.0
-_MIN_ILLUMINATED = 0.01
 
 
 @dataclass(frozen=True)
@@ -41,23 +39,15 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
 
     Stores frame time, delay and stale images in the bench.
     """
-    if bench.illuminated.mean() < _MIN_ILLUMINATED:
-        return (
-            Check(
-                "latency",
-                "unknown",
-                "The delay cannot be measured: no change of light is visible.",
-                "",
-                {},
-            ),
-            None,
-        )
+    if bench.illuminated.mean() < LEAST_LIT:
+        text = "The delay cannot be measured: no change of light is visible."
+        return Check("latency", "unknown", text), None
     begin_s = [bench.grab_timed()[0] for _ in range(6)]
     bench.frame_ms = max(1000 * float(np.median(np.diff(begin_s))), 1e-3)
     changes = [_time_change(bench, i) for i in range(_CHANGE_COUNT)]
     lost = sum(not change.arrived for change in changes)
     if lost:
-        sentence = (
+        text = (
             f"After {lost} of {_CHANGE_COUNT} changes the camera saw nothing new within"
             f" {_TIMEOUT_S:g} s."
         )
@@ -65,10 +55,8 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
             "Check that the projector really changes its picture, and that the camera sends fresh"
             " images."
         )
-        return (
-            Check("latency", "bad", sentence, remedy, {"changes": _CHANGE_COUNT, "unseen": lost}),
-            None,
-        )
+        figures: dict[str, Any] = {"changes": _CHANGE_COUNT, "unseen": lost}
+        return Check("latency", "bad", text, remedy, figures), None
     settle = _compute_settle_ms([change.arrival_ms(0) for change in changes], bench.frame_ms)
     bench.stale = max(_count_stale(bench, settle, i) for i in range(_STALE_TRIALS))
     fresh = [change.arrival_ms(bench.stale) for change in changes]
@@ -83,16 +71,14 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
         "settle_ms": settle,
         "stale_images": bench.stale,
     }
-    verdict, sentence, remedy = _judge_delay(bench, max(fresh))
-    return Check("latency", verdict, sentence, remedy, figures), settle
+    return _judge_delay(bench, max(fresh), figures), settle
 
 
-def _judge_delay(bench: RigUnderTest, latest_ms: float) -> tuple[CheckVerdict, str, str]:
-    """Verdict, sentence and remedy for the measured delay, whose fresh images began ``latest_ms``
-    late at most."""
+def _judge_delay(bench: RigUnderTest, latest_ms: float, figures: dict[str, Any]) -> Check:
+    """The check of the measured delay, whose fresh images began ``latest_ms`` late at most."""
     if bench.stale:
         many = "one image" if bench.stale == 1 else f"{bench.stale} images"
-        sentence = (
+        text = (
             f"The camera is {many} behind: it hands out images that are older than the request,"
             " however long one waits."
         )
@@ -100,25 +86,22 @@ def _judge_delay(bench: RigUnderTest, latest_ms: float) -> tuple[CheckVerdict, s
             "Switch the camera's buffering off, or let its driver discard old images; a longer wait"
             " does not help."
         )
-        return "bad", sentence, remedy
+        return Check("latency", "bad", text, remedy, figures)
+    text = (
+        f"Light arrives up to {latest_ms:.0f} ms ({latest_ms / bench.frame_ms:.1f} camera frames)"
+        f" after the projector reports the image as shown; captures wait {bench.settle_ms:g} ms."
+    )
     if bench.settle_ms == 0:
-        sentence = (
+        text = (
             "Light arrives as soon as the projector reports it: the first image after each change"
             " is right."
         )
-    else:
-        sentence = (
-            f"Light arrives up to {latest_ms:.0f} ms ({latest_ms / bench.frame_ms:.1f} camera"
-            " frames) after the projector reports the image as shown; captures wait"
-            f" {bench.settle_ms:g} ms."
-        )
     if bench.settle_ms <= _LONG_MS:
-        return "good", sentence, ""
-    return (
-        "warning",
-        sentence,
-        "Switch the projector's picture processing off (game mode), so that captures are quicker.",
+        return Check("latency", "good", text, "", figures)
+    remedy = (
+        "Switch the projector's picture processing off (game mode), so that captures are quicker."
     )
+    return Check("latency", "warning", text, remedy, figures)
 
 
 def _time_change(bench: RigUnderTest, i: int) -> _Change:

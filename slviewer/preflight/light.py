@@ -86,16 +86,8 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
         verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         text = f"{100 * clipped:.1f} % of what the projector lights is saturated in white light."
         if bright < 0.985 * full:
-            return (
-                Check(
-                    "exposure",
-                    verdict,
-                    text,
-                    "Turn what shines, or capture with two exposures.",
-                    figures,
-                ),
-                None,
-            )
+            remedy = "Turn what shines, or capture with two exposures."
+            return Check("exposure", verdict, text, remedy, figures), None
         return Check("exposure", verdict, text, f"{change}, then check again.", figures), wanted
     if bright < WEAK * full:
         verdict = "bad" if bright < TOO_WEAK * full else "warning"
@@ -155,7 +147,7 @@ def _fail_gamma(why: str, fault: str) -> tuple[Check, None, float]:
     """The result of `check_gamma` where nothing can be measured, and the ``fault`` to correct
     before."""
     text = f"The response cannot be measured: {why}."
-    return Check("gamma", "unknown", text, f"Correct {fault} first.", {}), None, 0.5
+    return Check("gamma", "unknown", text, f"Correct {fault} first."), None, 0.5
 
 
 _BRIGHT, _TOO_BRIGHT = 0.35, 0.8  # room over projector
@@ -202,13 +194,8 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
     """Check brightness changes from image to image beyond the noise."""
     where, span = bench.usable(), max(bench.contrast, 1e-6)
     if not where.any():
-        return Check(
-            "flicker",
-            "unknown",
-            "Flicker cannot be measured: all that is illuminated is saturated.",
-            "",
-            {},
-        )
+        text = "Flicker cannot be measured: all that is illuminated is saturated."
+        return Check("flicker", "unknown", text)
     noise = bench.noise / np.sqrt(where.sum()) / span
     (white_rest, drift), (dark_rest, _) = (
         _remove_drift(images[:, where].mean(axis=1, dtype=float) / span, seconds)

@@ -10,12 +10,18 @@ from msgspec import structs
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic, measure_second_harmonic
 from slviewer.errors import InputError
 from slviewer.examination.light import look_at
-from slviewer.fringe.layout import axis_layout, white_level
+from slviewer.examination.limits import LEAST_LIT
+from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.phase_shifting import dark_limit, dark_sigmas
 from slviewer.fringe.response import measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
+from slviewer.pipeline.capture_phases import (
+    NEAR_DARK,
+    axis_figures,
+    check_capture,
+    decode_frames,
+    least_modulation,
+)
 from slviewer.pipeline.examination import (
     Check,
     CheckName,
@@ -54,9 +60,6 @@ _STEADINESS: dict[CheckName, tuple[tuple[Cause, ...], str, str]] = {
 _FEW, _TOO_FEW = 0.75, 0.25
 """Shares of the illuminated pixels that must decode: below the first a warning, below the other
 most is lost."""
-_LEAST_ILLUMINATED = 0.005
-"""Share of the image that must carry a pattern: half a percent is a board in a corner of the
-image."""
 
 
 def preflight_capture(capture: Capture, progress: Progress = ignore_progress) -> Preflight:
@@ -116,13 +119,11 @@ def _check_description(examination: Examination, error: InputError | None = None
         verdict: CheckVerdict = "bad" if examination.rejected else "warning"
         remedy = "; ".join(dict.fromkeys(f.remedy for f in found))
         sentence = _join_findings([f.observation for f in found])
-        return Check("description", verdict, sentence, format_sentence(remedy), {})
+        return Check("description", verdict, sentence, format_sentence(remedy))
     if error:
         sentence = format_sentence(error.located_observation)
-        return Check("description", "bad", sentence, format_sentence(error.remedy), {})
-    return Check(
-        "description", "good", "The frames agree with the description of the patterns.", "", {}
-    )
+        return Check("description", "bad", sentence, format_sentence(error.remedy))
+    return Check("description", "good", "The frames agree with the description of the patterns.")
 
 
 def _check_steadiness(examination: Examination) -> Iterator[Check]:
@@ -145,10 +146,10 @@ def _check_response(
     harmonics = {axis: measure_second_harmonic(sequence, frames, axis) for axis in sequence.axes}
     known = {axis: value for axis, value in harmonics.items() if np.isfinite(value)}
     if found := _list_sentences(examination, "gamma"):
-        return Check("gamma", "warning", _join_findings(found), remedy, {})
+        return Check("gamma", "warning", _join_findings(found), remedy)
     if not known:
         why = "fewer than five phase steps, or too few pixels that see fringes"
-        return Check("gamma", "unknown", f"The response cannot be measured: {why}.", "", {})
+        return Check("gamma", "unknown", f"The response cannot be measured: {why}.")
     axis = max(known, key=lambda each: abs(known[each]))
     gamma, steps = gamma_from_harmonic(known[axis]), axis_layout(sequence, axis).steps
     shown = np.linspace(0, 255, 18)
@@ -180,22 +181,12 @@ def _check_noise(
     figures: dict[str, Any] = {}
     lines, weak = [], False
     for axis, phase in phases.items():
-        valid = phase.mask
-        if not valid.any():
+        if not phase.mask.any():
             continue
-        background, modulation = (
-            float(np.median(values[valid])) for values in (phase.background, phase.modulation)
-        )
-        noise = float(np.sqrt(phase.noise[0] + phase.noise[1] * background))
-        sigma = float(np.median(phase.sigma_phase[valid])) * phase.period_px / (2 * np.pi)
-        white = white_level(sequence, frames, sequence.select(axis))
-        least = dark_limit(
-            np.array([background], np.float32),
-            phase.noise,
-            white,
-            dark_sigmas(axis_layout(sequence, axis)),
-        )
-        weak |= modulation < NEAR_DARK * float(least[0])
+        medians = axis_figures(phase)
+        names = ("noise_levels", "median_modulation", "median_sigma_px")
+        noise, modulation, sigma = (medians[name] for name in names)
+        weak |= modulation < NEAR_DARK * least_modulation(sequence, frames, phase)
         figures[axis] = {
             "noise_levels": round(noise, 3),
             "median_modulation_levels": round(modulation, 2),
@@ -206,7 +197,7 @@ def _check_noise(
             f" {sigma:.3f} px"
         )
     if not lines:
-        return Check("noise", "unknown", "The noise cannot be judged: no pixel is valid.", "", {})
+        return Check("noise", "unknown", "The noise cannot be judged: no pixel is valid.")
     sentence = _join_findings(lines)
     if weak:
         remedy = (
@@ -237,7 +228,7 @@ def _check_decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
             " image decode"
         )
     verdict: CheckVerdict = "warning" if worst < _FEW else "good"
-    if least < _LEAST_ILLUMINATED or worst < _TOO_FEW:
+    if least < LEAST_LIT or worst < _TOO_FEW:
         verdict = "bad"
     remedy = (
         ""

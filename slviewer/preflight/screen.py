@@ -5,6 +5,7 @@ import numpy as np
 
 from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
+from slviewer.examination.limits import LEAST_LIT
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.examination import Check
@@ -12,7 +13,7 @@ from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CODE = (1, 0, 1, 1, 0, 0, 1, 0)
 _MIN_CORRELATION = 0.9  # correlation with the code
-_NOTHING, _LITTLE = 0.01, 0.1  # shares of the image
+_LITTLE = 0.1  # of the image
 
 
 def check_screen(bench: RigUnderTest) -> Check:
@@ -30,13 +31,9 @@ def check_screen(bench: RigUnderTest) -> Check:
         amplitude > max(4 * bench.noise, 0.01 * bench.full)
     )
     share = float(follows.mean())
-    if share >= _NOTHING:
-        bench.illuminated = follows
-    figures = {
-        "share_that_follows": round(share, 4),
-        "contrast_levels": round(float(_compute_median(amplitude, follows)), 1),
-    }
-    if share < _NOTHING:
+    contrast = float(np.median(amplitude[follows])) if share else 0.0
+    figures = {"share_that_follows": round(share, 4), "contrast_levels": round(contrast, 1)}
+    if share < LEAST_LIT:
         return Check(
             "screen",
             "bad",
@@ -45,6 +42,7 @@ def check_screen(bench: RigUnderTest) -> Check:
             " that the lens cap is off, and that the camera looks at what it lights.",
             figures,
         )
+    bench.illuminated = follows
     if share < _LITTLE:
         return Check(
             "screen",
@@ -56,11 +54,6 @@ def check_screen(bench: RigUnderTest) -> Check:
         )
     text = f"{100 * share:.0f} % of the image follows the projector's light."
     return Check("screen", "good", text, "", figures)
-
-
-def _compute_median(values: np.ndarray, where: np.ndarray) -> float:
-    """Median of the values at the selected pixels; 0 where there is none."""
-    return float(np.median(values[where])) if where.any() else 0.0
 
 
 _MIN_GREY_CONTRAST = 0.08  # grey must be so far from half as bright as white

@@ -24,9 +24,7 @@ def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> C
     )
     measured = np.isfinite(grids[0])
     if not measured.any():
-        return Check(
-            "motion", "unknown", "Motion cannot be seen: too little is illuminated.", "", {}
-        )
+        return Check("motion", "unknown", "Motion cannot be seen: too little is illuminated.")
     blocks = grids[:, measured]
     blocks = np.stack([_match_light(image, blocks[0]) for image in blocks])
     noise = 1.4826 * float(np.median(np.abs(np.diff(blocks[1:-1], axis=0)))) / np.sqrt(2)
