@@ -1,6 +1,6 @@
 """Evaluation of hypotheses about a capture on its sample."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -119,14 +119,21 @@ class Evaluator:
             self._matches[key] = match(sample, atoms, list(images))
         return self._matches[key]
 
+    def matched(self, *hypotheses: Hypothesis) -> Iterator[tuple[Axis, Sample, Match]]:
+        """Yield each axis that is matched, its sample, and its match under the one of the
+        hypotheses that is about it, else under the first."""
+        for axis, sample in self.sample.by_axis.items():
+            own = next((h for h in hypotheses if h.axis == axis), hypotheses[0])
+            if (m := self.match(own, axis)) is not None:
+                yield axis, sample, m
+
     def explained(self, hypothesis: Hypothesis) -> Iterator[tuple[Axis, Sample, Match, np.ndarray]]:
         """Yield each axis of which enough pixels are explained: its sample, its match, and where
         they are, (p,) bool."""
-        for axis, sample in self.sample.by_axis.items():
-            if (m := self.match(hypothesis, axis)) is not None:
-                good = m.good(sample)
-                if np.count_nonzero(good) >= limits.FEWEST_PIXELS:
-                    yield axis, sample, m, good
+        for axis, sample, m in self.matched(hypothesis):
+            good = m.good(sample)
+            if np.count_nonzero(good) >= limits.FEWEST_PIXELS:
+                yield axis, sample, m, good
 
     def compare(self, base: Hypothesis, other: Hypothesis) -> "MisfitChange":
         """Compare a hypothesis with the ``base``, on the images that both use."""
@@ -161,57 +168,52 @@ class Evaluator:
         """Return the mean squared residual (n,) of each image in squares of the pattern's contrast,
         NaN where it is not matched."""
         out = np.full(len(hypothesis.images), np.nan)
-        for axis, sample in self.sample.by_axis.items():
-            if (m := self.match(hypothesis, axis)) is not None:
-                least = 1e-3 + limits.LEAST_CONTRAST / 3 * sample.swing
-                relative = m.residual(sample) / np.maximum(m.contrast, least)
-                out[m.images] = np.fmax(out[m.images], np.minimum(relative**2, 1).mean(axis=1))
+        for _, sample, m in self.matched(hypothesis):
+            least = 1e-3 + limits.LEAST_CONTRAST / 3 * sample.swing
+            relative = m.residual(sample) / np.maximum(m.contrast, least)
+            out[m.images] = np.fmax(out[m.images], np.minimum(relative**2, 1).mean(axis=1))
         return out
 
-    def jacobian(self, hypotheses: Sequence[Hypothesis]) -> np.ndarray | None:
-        """Return the change (2, 2) of projector column and row with the camera's, over the image;
-        None where one of them is not known.
-
-        Each axis under that of the hypotheses which is about it, else under the first.
-        """
-        slopes = []
-        for axis, sample in self.sample.by_axis.items():
-            m = self.match(_select_own(hypotheses, axis), axis)
-            if m is None or np.count_nonzero(sure := m.good(sample)) < limits.FEWEST_PIXELS / 2:
-                return None
+    def coordinates(self, *hypotheses: Hypothesis) -> "Coordinates":
+        """Return how the projector's coordinates run over the image, each axis under the one of the
+        hypotheses that is about it, else under the first."""
+        sequence = hypotheses[0].sequence
+        slopes, folded = list[np.ndarray](), list[Axis]()
+        beyond: dict[Axis, tuple[np.ndarray, float]] = {}
+        for axis, sample, m in self.matched(*hypotheses):
+            u = m.coordinate[m.misfit < limits.GOOD]
+            if sequence.projector_size and u.size:
+                share = float(np.mean(u > sequence.extent(axis) + 0.5))
+                if share > limits.OUTSIDE[bool(sequence.find("gray", axis))]:
+                    beyond[axis] = u, share
+            if np.count_nonzero(sure := m.good(sample)) < limits.FEWEST_PIXELS / 2:
+                continue
             design, good = np.c_[np.ones(len(sure)), sample.place], sure
             for _ in range(4):  # without the surfaces before or behind most
                 fit, *_ = np.linalg.lstsq(design[good], m.coordinate[good], rcond=None)
                 off = np.abs(design @ fit - m.coordinate)
                 good = sure & (off < 3 * np.median(off[good]) + 1)
             slopes.append(fit[:0:-1])
-        return np.array(slopes) if len(slopes) == 2 else None
+            if float(np.median(m.rise[sure])) * slopes[-1][1 - sample.direction] < 0:
+                folded.append(axis)
+        if len(slopes) < 2:
+            return Coordinates(None, beyond, [])
+        return Coordinates(np.array(slopes), beyond, folded)
 
-    def list_beyond(self, hypotheses: Sequence[Hypothesis]) -> dict[Axis, tuple[np.ndarray, float]]:
-        """Return the coordinates (p,) px of each axis of which too large a share lies beyond the
-        projector, under the hypotheses, and that share."""
-        out: dict[Axis, tuple[np.ndarray, float]] = {}
-        for axis in self.sample.by_axis:
-            own = _select_own(hypotheses, axis)
-            sequence, m = own.sequence, self.match(own, axis)
-            if m is not None and sequence.projector_size:
-                u = m.coordinate[m.misfit < limits.GOOD]
-                share = float(np.mean(u > sequence.extent(axis) + 0.5)) if u.size else 0.0
-                if share > limits.OUTSIDE[bool(sequence.find("gray", axis))]:
-                    out[axis] = u, share
-        return out
 
-    def list_folded(self, hypotheses: Sequence[Hypothesis], jacobian: np.ndarray) -> list[Axis]:
-        """Return the axes whose coordinates fall from neighbour to neighbour where they rise over
-        the image, or the other way round, under the hypotheses, of which `jacobian` is known."""
-        out = list[Axis]()
-        for i, (axis, sample) in enumerate(self.sample.by_axis.items()):
-            m = self.match(_select_own(hypotheses, axis), axis)
-            if m is not None:
-                local = float(np.median(m.rise[m.good(sample)]))
-                if local * jacobian[i, 1 - sample.direction] < 0:
-                    out.append(axis)
-        return out
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """How the projector's coordinates run over the image.
+
+    ``jacobian`` (2, 2): change of projector column and row with the camera's, None where one of
+    them is not known; ``beyond``: the coordinates (p,) px of each axis of which too large a share
+    lies beyond the projector, and that share; ``folded``: axes whose coordinates fall from
+    neighbour to neighbour where they rise over the image, or the other way round.
+    """
+
+    jacobian: np.ndarray | None
+    beyond: dict[Axis, tuple[np.ndarray, float]]
+    folded: list[Axis]
 
 
 @dataclass(frozen=True)
@@ -232,11 +234,6 @@ class MisfitChange:
     def left(self) -> float:
         """Mean share of the variance that the first leaves."""
         return self.loss - self.gain
-
-
-def _select_own(hypotheses: Sequence[Hypothesis], axis: Axis) -> Hypothesis:
-    """Return the one of the hypotheses that is about an axis, else the first."""
-    return next((h for h in hypotheses if h.axis == axis), hypotheses[0])
 
 
 def _list_conventions(hypothesis: Hypothesis, axis: Axis) -> tuple[object, ...]:

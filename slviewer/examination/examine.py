@@ -11,6 +11,7 @@ from slviewer.examination.evaluate import Evaluator, Hypothesis, described, use_
 from slviewer.examination.explain import Explanation, explain, list_unresolved
 from slviewer.examination.findings import (
     REMEDIES,
+    contradict,
     describe_gamma,
     describe_ghost,
     describe_hypothesis,
@@ -29,8 +30,6 @@ from slviewer.examination.motion import is_displaced, measure_motion
 from slviewer.fringe.aliased_harmonics import MOST_STEPS, estimate_aliased_harmonics
 from slviewer.fringe.decoding_task import prepare_decoding
 from slviewer.fringe.frame_light import FrameLight
-from slviewer.fringe.layout import axis_layout
-from slviewer.fringe.levels import layout_levels
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.verdict import Examination, Finding
 
@@ -150,9 +149,8 @@ def _fill_in(hypothesis: Hypothesis) -> Hypothesis:
 def _judge_readability(evaluator: Evaluator, base: Hypothesis) -> Iterator[Finding]:
     """Yield the findings of an axis that no hypothesis makes readable, and of stripes that the
     camera does not resolve."""
-    for axis, sample in evaluator.sample.by_axis.items():
-        m = evaluator.match(base, axis)
-        if m is not None and m.misfit.mean() > limits.UNREADABLE:
+    for axis, sample, m in evaluator.matched(base):
+        if m.misfit.mean() > limits.UNREADABLE:
             is_weak = np.median(sample.swing) < limits.WEAK * evaluator.sample.noise
             yield describe_unreadable(axis, is_weak)
     if unresolved := list_unresolved(evaluator, base):
@@ -163,20 +161,15 @@ def _judge_coordinates(evaluator: Evaluator, base: Hypothesis) -> Iterator[Findi
     """Yield the finding of mirrored coordinates, else of codes that the description cannot hold, or
     that lie beyond the projector."""
     sequence = base.sequence
-    jacobian = evaluator.jacobian((base,))
+    coordinates = evaluator.coordinates(base)
+    jacobian, beyond = coordinates.jacobian, coordinates.beyond
     mirrored = [] if jacobian is None else [*describe_mirroring(sequence, jacobian)]
     yield from mirrored
-    beyond = evaluator.list_beyond((base,))
     for axis in sequence.axes if sequence.projector_size and not mirrored else ():
-        try:
-            layout = axis_layout(sequence, axis)
-            if layout.shifts and not layout.numbers_periods:
-                layout_levels(layout)
-        except InputError as error:
+        if error := contradict(sequence, axis):
             remedy = error.remedy or REMEDIES["projector-size"]
-            yield Finding("projector-size", "rejected", error.observation, remedy, (), (), axis)
-            continue
-        if axis in beyond:
+            yield Finding("projector-size", "rejected", error.observation, remedy, axis=axis)
+        elif axis in beyond:
             yield describe_reach(axis, sequence.extent(axis), *beyond[axis])
 
 

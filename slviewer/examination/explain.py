@@ -68,8 +68,8 @@ def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
     """Return whether the description leaves more than noise, in all images or in one, or gives
     coordinates beyond the projector, or that fall from neighbour to neighbour where they rise over
     the image: aliases, which fit as well where the patterns have few levels."""
-    J = evaluator.jacobian((base,))
-    if evaluator.list_beyond((base,)) or (J is not None and evaluator.list_folded((base,), J)):
+    coordinates = evaluator.coordinates(base)
+    if coordinates.beyond or coordinates.folded:
         return True
     residuals = evaluator.residuals(base)
     for axis in evaluator.sample.by_axis:
@@ -90,7 +90,7 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
     gained = _turned(evaluator, (base,))
     rated = [
         r
-        for r in sorted(_rate_all(evaluator, base), key=_net, reverse=True)
+        for r in sorted(_rate_all(evaluator, base), key=lambda r: -r.net)
         if r.comparison.sigmas > _least_sigmas(r, gained)
         and r.net + gained > 0
         # a strange image misleads everywhere; edges of surfaces and beats are misread in lines
@@ -139,7 +139,7 @@ def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
     if len(by_axis) == 2:
         joint = [_rate(evaluator, base, (a, b)) for (_, a), (_, b) in product(*by_axis)]
         rated += [r for r in joint if r.comparison.sigmas > limits.SIGMAS]
-    best = max(rated, key=_net).hypotheses[0]
+    best = max(rated, key=lambda r: r.net).hypotheses[0]
     return rated + [_rate(evaluator, base, (h,)) for h in list_neighbours(best)]
 
 
@@ -190,11 +190,6 @@ def _least_sigmas(rated: _Rated, gained: float) -> float:
     return limits.SIGMAS_CONFIRMED if is_impossible and is_possible else limits.SIGMAS
 
 
-def _net(rated: _Rated) -> float:
-    """Return what an explanation is worth."""
-    return rated.net
-
-
 def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _Rated:
     """Compare hypotheses of different axes with the description, on all pixels."""
     each = [evaluator.compare(base, h) for h in hypotheses]
@@ -210,11 +205,11 @@ def _turned(evaluator: Evaluator, hypotheses: Explanation) -> float:
     """Return the cost of coordinates beyond the projector, and of the directions in which they
     rise: the same from neighbour to neighbour and over the image; camera and projector both see the
     scene from the front, and mostly stand upright."""
-    J = evaluator.jacobian(hypotheses)
-    cost = limits.FOLDED_COST * len(evaluator.list_beyond(hypotheses))
+    coordinates = evaluator.coordinates(*hypotheses)
+    J = coordinates.jacobian
+    cost = limits.FOLDED_COST * (len(coordinates.beyond) + len(coordinates.folded))
     if J is None:
         return cost
-    cost += limits.FOLDED_COST * len(evaluator.list_folded(hypotheses, J))
     if np.linalg.det(J) < 0:
         return cost + limits.MIRRORED_COST
     return cost + (limits.TURNED_COST if J[0, 0] < 0 and J[1, 1] < 0 else 0.0)
@@ -286,9 +281,7 @@ def _measure_left(
     """Return the share (p,) of the variance of all images that is left at each pixel if image k,
     which the hypothesis leaves out, shows the pattern of frame j of its axis; None: even light."""
     losses = list[np.ndarray]()
-    for axis, sample in evaluator.sample.by_axis.items():
-        if (m := evaluator.match(hypothesis, axis)) is None:
-            continue
+    for axis, sample, m in evaluator.matched(hypothesis):
         atoms, residuals = evaluator.atoms(hypothesis, axis), [*m.residual(sample)]
         if k in atoms.frames:
             seen = sample.levels[k, 1] - m.background

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil, floor
+from typing import Any
 
 import numpy as np
 
@@ -58,41 +59,39 @@ _Change = tuple[str, Mapping[str, PatternSequence]]
 """A remedy with {} for its value, and the description that follows from each value."""
 
 
+def _find(cause: Cause, observation: str, severity: Severity = "rejected", **place: Any) -> Finding:
+    """Return the finding of a cause whose remedy depends on no value; ``place``: its frames, axis
+    and value."""
+    return Finding(cause, severity, observation, REMEDIES[cause], **place)
+
+
 def describe_hypothesis(hypothesis: Hypothesis, evaluator: Evaluator, base: Hypothesis) -> Finding:
     """Return the finding that a hypothesis stands for; ``base``: the capture as described."""
-    cause = hypothesis.cause
+    cause, axis = hypothesis.cause, hypothesis.axis
     assert cause is not None
-    if hypothesis.axis is None:
-        sentence, remedy = _describe_order(hypothesis)
+    if axis is None:
+        text, remedy = _describe_order(hypothesis, cause)
     else:
-        sentence, changes = _describe_convention(hypothesis, base.sequence, hypothesis.axis)
-        tried = (_try_changes(evaluator, hypothesis, *change) for change in changes)
-        remedy = ", or ".join(text for text in tried if text)
-        remedy = remedy or REMEDIES["unreadable"]
+        text, changes = _describe_convention(hypothesis, base.sequence, axis)
+        tried = (_try_changes(evaluator, hypothesis, axis, *change) for change in changes)
+        remedy = ", or ".join(filter(None, tried)) or REMEDIES["unreadable"]
     value = None if hypothesis.value is None else float(hypothesis.value)
-    return Finding(
-        cause, "rejected", sentence, remedy, (), hypothesis.frames, hypothesis.axis, value
-    )
+    return Finding(cause, "rejected", text, remedy, (), hypothesis.frames, axis, value)
 
 
 def _try_changes(
     evaluator: Evaluator,
     hypothesis: Hypothesis,
+    axis: Axis,
     text: str,
     sequences: Mapping[str, PatternSequence],
 ) -> str:
     """Return the remedy ``text`` with the value, of those of the ``sequences`` that make the
     capture decode, that explains the images best; empty where none explains them as well as the
     hypothesis."""
-    axis = hypothesis.axis
-    assert axis is not None
     misfits = {}
     for value, sequence in sequences.items():
-        try:
-            layout = axis_layout(sequence, axis)
-            if layout.shifts and not layout.numbers_periods:
-                layout_levels(layout)
-        except InputError:
+        if contradict(sequence, axis):
             continue
         if (m := evaluator.match(described(sequence), axis)) is not None:
             misfits[value] = float(m.misfit.mean())
@@ -102,6 +101,18 @@ def _try_changes(
     best = min(misfits, key=lambda value: misfits[value] * (1 + JOINT * (AND in value)))
     is_as_good = misfits[best] <= limits.AS_LITTLE * float(own.misfit.mean()) + limits.SMALL_LOSS
     return text.format(best) if is_as_good else ""
+
+
+def contradict(sequence: PatternSequence, axis: Axis) -> InputError | None:
+    """Return the error by which the periods and codes of an axis contradict each other or the
+    projector's size; None where they do not."""
+    try:
+        layout = axis_layout(sequence, axis)
+        if layout.shifts and not layout.numbers_periods:
+            layout_levels(layout)
+    except InputError as error:
+        return error
+    return None
 
 
 def _describe_lag(hypothesis: Hypothesis) -> tuple[str, str]:
@@ -129,9 +140,9 @@ def _describe_lag(hypothesis: Hypothesis) -> tuple[str, str]:
     )
 
 
-def _describe_order(hypothesis: Hypothesis) -> tuple[str, str]:
+def _describe_order(hypothesis: Hypothesis, cause: Cause) -> tuple[str, str]:
     """Return observation and remedy of an order of the images."""
-    cause, frames, value = hypothesis.cause, hypothesis.frames, hypothesis.value
+    frames, value = hypothesis.frames, hypothesis.value
     numbers = [i + 1 for i in frames]
     if cause == "frame-lag":
         return _describe_lag(hypothesis)
@@ -160,7 +171,6 @@ def _describe_order(hypothesis: Hypothesis) -> tuple[str, str]:
         return text, "put the frames in order, or capture again"
     else:
         text = f"frame {numbers[0]} does not show the pattern described for it"
-    assert cause is not None
     return text, REMEDIES[cause]
 
 
@@ -291,7 +301,7 @@ def describe_mirroring(sequence: PatternSequence, jacobian: np.ndarray) -> Itera
     remedy = "switch off the projector's mirror or rear mode"
     if not sequence.find("gray", axis):
         remedy += f", or set phase_sign = {-sequence.sign(axis)} for axis {axis}"
-    yield Finding("axis-reversed", "rejected", text, mirroring_remedy(remedy), (), (), axis)
+    yield Finding("axis-reversed", "rejected", text, mirroring_remedy(remedy), axis=axis)
 
 
 def mirroring_remedy(of_projector: str) -> str:
@@ -310,9 +320,7 @@ def describe_reach(axis: Axis, extent: int, coordinate: np.ndarray, share: float
         f"{100 * share:.0f} % of the {axis} codes lie outside the projector's {extent}"
         f" {LINES[axis]} and reach {reach:.0f}"
     )
-    return Finding(
-        "projector-size", "rejected", text, REMEDIES["projector-size"], (), (), axis, reach
-    )
+    return _find("projector-size", text, axis=axis, value=reach)
 
 
 def describe_missing_pattern(sample: CaptureSample) -> Finding:
@@ -323,24 +331,24 @@ def describe_missing_pattern(sample: CaptureSample) -> Finding:
             f"{100 * sample.saturated:.0f} % of the pixels are saturated in a tenth of the frames"
             " or more, so that too few carry a readable pattern"
         )
-        return Finding("saturation", "rejected", text, REMEDIES["saturation"])
+        return _find("saturation", text)
     text = (
         f"{100 * sample.lit:.1f} % of the pixels carry a readable pattern, and the median pixel"
         f" changes by {sample.swing:.1f} grey levels over the frames"
     )
-    return Finding("dark", "rejected", text, REMEDIES["dark"])
+    return _find("dark", text)
 
 
 def describe_unreadable(axis: Axis, is_weak: bool) -> Finding:
     """Return the finding of an axis whose frames fit no pattern; ``is_weak``: for noise."""
     if is_weak:
         text = f"the {axis} patterns are hardly stronger than the noise of the images"
-        return Finding("dark", "rejected", text, REMEDIES["dark"], (), (), axis)
+        return _find("dark", text, axis=axis)
     text = (
         f"the frames of axis {axis} fit neither their description, nor another order, numbering or"
         " size"
     )
-    return Finding("unreadable", "rejected", text, REMEDIES["unreadable"], (), (), axis)
+    return _find("unreadable", text, axis=axis)
 
 
 def describe_unresolved(sequence: PatternSequence, frames: Sequence[int]) -> Finding:
@@ -348,7 +356,7 @@ def describe_unresolved(sequence: PatternSequence, frames: Sequence[int]) -> Fin
     resolve."""
     names = sorted({f"{sequence.frames[i].bit} of {sequence.frames[i].axis}" for i in frames})
     text = f"the camera does not resolve the stripes of Gray bit {', '.join(names)}"
-    return Finding("blur", "doubtful", text, REMEDIES["blur"], (), tuple(frames))
+    return _find("blur", text, "doubtful", frames=tuple(frames))
 
 
 def describe_motion(sequence: PatternSequence, axis: Axis, displacement: float) -> Finding:
@@ -361,13 +369,13 @@ def describe_motion(sequence: PatternSequence, axis: Axis, displacement: float) 
         f" by {abs(displacement):.1f} px of the projector"
     )
     severity: Severity = "rejected" if is_much else "doubtful"
-    return Finding("moved", severity, text, REMEDIES["moved"], (), (), axis, displacement)
+    return _find("moved", text, severity, axis=axis, value=displacement)
 
 
 def describe_ghost(share: float) -> Finding:
     """Return the finding of images that hold a share of the one before."""
     text = f"the images hold {100 * share:.0f} % of the image before them (ghosting)"
-    return Finding("ghosting", "doubtful", text, REMEDIES["ghosting"])
+    return _find("ghosting", text, "doubtful")
 
 
 def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Finding]:
@@ -384,32 +392,25 @@ def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Fin
             f" {light.cycles:.1f} waves per image (mains flicker under a rolling shutter),"
             " which is corrected"
         )
-        yield _of_light("flicker", text, used[0])
+        yield _find("flicker", text, "doubtful", frames=(used[0],))
     if "gain" in light.terms and span > limits.REPORTED:
         text = (
             f"the brightness varies by {100 * span:.1f} % among frames of a kind (automatic"
             f" exposure, or an unsteady lamp{moving}), which is corrected"
         )
         frame = used[int(np.argmax(np.abs(np.log(gain))))]
-        yield _of_light("exposure-drift", text, frame)
+        yield _find("exposure-drift", text, "doubtful", frames=(frame,))
     for k in light.changes if "room" in light.terms else ():
         change = float(light.room[k] - light.room[k - 1])
         text = (
             f"the light of the room changed: from frame {k + 1} on the scene is"
             f" {100 * abs(change):.0f} % {'brighter' if change > 0 else 'darker'}"
         )
-        steps = light.count_open_steps(sequence, k)
-        text += (
-            f"; between {steps} phase steps this cannot be corrected reliably"
-            if steps
-            else (", which is corrected")
-        )
-        yield _of_light("room-light", text, k)
-
-
-def _of_light(cause: Cause, sentence: str, frame: int) -> Finding:
-    """Return the finding of light that differs from a frame on."""
-    return Finding(cause, "doubtful", sentence, REMEDIES[cause], (), (frame,))
+        if steps := light.count_open_steps(sequence, k):
+            text += f"; between {steps} phase steps this cannot be corrected reliably"
+        else:
+            text += ", which is corrected"
+        yield _find("room-light", text, "doubtful", frames=(k,))
 
 
 def describe_disturbance(terms: Sequence[Term]) -> Finding:
@@ -421,7 +422,7 @@ def describe_disturbance(terms: Sequence[Term]) -> Finding:
         cause, text = "room-light", "the light of the room changes between the frames"
     else:
         cause, text = "exposure-drift", "the brightness varies from frame to frame"
-    return Finding(cause, "rejected", f"{text} by more than can be corrected", REMEDIES[cause])
+    return _find(cause, f"{text} by more than can be corrected")
 
 
 def describe_gamma(
@@ -448,4 +449,4 @@ def describe_gamma(
         f" shifts the coordinates of axis {layout.axis} by up to {largest:.2g} px ({outcome})"
     )
     frames = layout.shifts[-1].indices[:1]
-    yield Finding("gamma", severity, text, REMEDIES["gamma"], (), frames, layout.axis)
+    yield _find("gamma", text, severity, frames=frames, axis=layout.axis)

@@ -195,8 +195,7 @@ def _score(
     if len(gain) < limits.FEWEST_PIXELS / 2:
         return np.inf
     before, after = (
-        np.concatenate([m.misfit for axis in base.sequence.axes if (m := each.match(base, axis))])
-        for each in (evaluator, equal)
+        np.concatenate([m.misfit for *_, m in each.matched(base)]) for each in (evaluator, equal)
     )
     misfit = after.mean() / before.mean()
     # a few pixels may be read otherwise by chance
@@ -270,10 +269,7 @@ def _project(
     """Yield the residual of each axis under a light; ``equal``: the same pixels under equal
     light."""
     sequence, white = base.sequence, evaluator.sample.white
-    for axis, sample in equal.sample.by_axis.items():
-        m = equal.match(base, axis)
-        if m is None:
-            continue
+    for axis, sample, m in equal.matched(base):
         good = m.misfit <= max(limits.GOOD, float(np.median(m.misfit)))
         good &= m.contrast > limits.LEAST_CONTRAST * sample.swing
         if np.count_nonzero(good) < limits.FEWEST_PIXELS / 2:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.fringe import limits
+from slviewer.examination import limits
 from slviewer.fringe.cosines import estimate_roughness
 from slviewer.fringe.layout import clip_level
 
@@ -15,9 +15,6 @@ GRID = 100
 """Pixels along the shorter side of the grid that shows where the patterns are."""
 BLOCK = 4
 """Neighbouring columns that are read together: they share the memory's cache lines."""
-NOISE_RANGE = 2 * limits.DARK_SIGMAS
-"""Range of a pixel's grey levels, in standard deviations, from which it shows a pattern: in fifty
-frames of noise alone the range stays below seven in 99.99 % of the pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +40,7 @@ def sample_lines(stack: np.ndarray, pixels: int = PIXELS) -> LineSample:
     step = max(1, min(height, width) // GRID)
     grid = np.ascontiguousarray(stack[:, step // 2 :: step, step // 2 :: step])
     swing = (grid.max(axis=0) - grid.min(axis=0)).astype(np.float32)
-    least = 2 * limits.DARK_LEVELS * clip_level(grid.dtype, int(grid.max())) / 255
+    least = limits.DARK_SHARE * clip_level(grid.dtype, int(grid.max()))
     pattern = np.maximum(swing - least, 0)
     rows = _select_lines(pattern.sum(axis=1), step, height, round(pixels / width))
     columns = _select_lines(pattern.sum(axis=0), step, width, round(pixels / height / BLOCK))
@@ -55,7 +52,7 @@ def sample_lines(stack: np.ndarray, pixels: int = PIXELS) -> LineSample:
     place = np.concatenate([np.tile(np.arange(size), count) for count, size in counts])
     levels = np.concatenate(frames, axis=1).astype(np.float32)
     noise = estimate_roughness(levels[:, : len(rows) * width], width)
-    return LineSample(levels, line, len(rows), place, max(least, NOISE_RANGE * noise))
+    return LineSample(levels, line, len(rows), place, max(least, limits.DARK_SIGMAS * noise))
 
 
 def _select_lines(weight: np.ndarray, step: int, size: int, count: int) -> np.ndarray:

@@ -58,14 +58,14 @@ _SATURATED_FACTOR = (
 def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     """Check the exposure; return the check and the exposure in ms to set, None where it is right or
     unknown."""
-    level, full = bench.white[bench.illuminated], bench.full
+    level, full, clip = bench.white[bench.illuminated], bench.full, bench.clip
     bright = float(np.quantile(level, 0.995))
-    clipped = float(np.mean(level >= 0.985 * full))
+    clipped = float(np.mean(level >= clip))
     black = float(np.median(bench.dark[bench.illuminated]))
     present = bench.read_exposure_ms()
     factor = (
         _SATURATED_FACTOR
-        if bright >= 0.985 * full
+        if bright >= clip
         else (_TARGET_LEVEL * full - black) / max(bright - black, 1.0)
     )
     wanted = None if present is None else float(f"{present * factor:.3g}")
@@ -85,7 +85,7 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     if clipped > CLIPPED:
         verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         text = f"{100 * clipped:.1f} % of what the projector lights is saturated in white light."
-        if bright < 0.985 * full:
+        if bright < clip:
             remedy = "Turn what shines, or capture with two exposures."
             return Check("exposure", verdict, text, remedy, figures), None
         return Check("exposure", verdict, text, f"{change}, then check again.", figures), wanted

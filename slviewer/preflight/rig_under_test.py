@@ -139,6 +139,12 @@ class RigUnderTest:
         return image_white(image, int(stated))
 
     @property
+    def clip(self) -> float:
+        """The grey level from which a pixel is saturated: mean levels of several images are a
+        little below the one at which the camera clips."""
+        return 0.985 * self.full
+
+    @property
     def contrast(self) -> float:
         """Grey levels of the projector's white light: median over the illuminated pixels."""
         return (
@@ -149,7 +155,7 @@ class RigUnderTest:
 
     def usable(self) -> np.ndarray:
         """(h, w) bool: illuminated, and not clipped in white light."""
-        return self.illuminated & (self.white < 0.985 * self.full) & (self.dark < 0.9 * self.full)
+        return self.illuminated & (self.white < self.clip) & (self.dark < 0.9 * self.full)
 
     def share(self, image: np.ndarray, where: np.ndarray) -> float:
         """The projector's light in an image, 0 for dark, 1 for white, summed over some pixels."""
