@@ -2,6 +2,7 @@
 
 A response is given as `shown` (n,) grey levels, increasing from 0 to 255, and `seen` (n,) light, 0
 for dark and 1 for white, noise included. Between them it is a monotone piecewise cubic (PCHIP).
+Where only fringes were captured, their second harmonic shows its exponent.
 """
 
 import numpy as np
@@ -9,6 +10,9 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
 from slviewer.errors import InputError
+from slviewer.fringe.cosines import FEWEST, select_rows
+from slviewer.fringe.layout import axis_layout, white_level
+from slviewer.fringe.sequence import Axis, PatternSequence
 
 _FINE = 16  # places per grey level at which a response is tabulated before it is inverted
 
@@ -83,3 +87,39 @@ def _check_response(shown: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np
             "measure it where the projector lights the scene",
         )
     return x, y
+
+
+def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
+    """Return the amplitude of the finest fringe's second harmonic over the first, positive for a
+    gamma above 1.
+
+    NaN for fewer than five phase steps, which do not separate the two, and where too few pixels
+    have fringes.
+    """
+    layout = axis_layout(sequence, axis)
+    if layout.steps < 5:
+        return np.nan
+    indices = layout.shifts[-1].indices
+    rows = select_rows(*stack.shape[1:])
+    frames = np.stack([stack[i][rows].ravel() for i in indices])
+    white = white_level(sequence, stack, indices)
+    frames = frames[:, (frames.max(0) < white) & (frames.min(0) > 0)].astype(np.float32)
+    first, second = np.fft.fft(frames, axis=0)[1:3] * (2 / len(indices))
+    strength = np.abs(first)
+    weakest = 0.3 * np.quantile(strength, 0.95) if strength.size else np.inf
+    modulated = strength > max(8.0 * white / 255, weakest)
+    if np.count_nonzero(modulated) < FEWEST:
+        return np.nan
+    first, second, strength = first[modulated], second[modulated], strength[modulated]
+    along = np.real(second * np.conj(first / strength) ** 2)
+    return float(np.sum(along) / np.sum(strength))
+
+
+def gamma_from_harmonic(harmonic: float) -> float:
+    """Return the exponent for which a power of a sinusoidal fringe has this ratio of second
+    harmonic to first.
+
+    Powers have ratios from -0.5 to 1; others are taken for the nearest of these.
+    """
+    harmonic = float(np.clip(harmonic, -0.49, 0.99))
+    return (1 + 2 * harmonic) / (1 - harmonic)

@@ -7,13 +7,17 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from slviewer.calibration.diagnosis.frames import gamma_from_harmonic, measure_second_harmonic
 from slviewer.errors import InputError
 from slviewer.examination.light import look_at
 from slviewer.examination.limits import LEAST_LIT
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.response import measure_nonlinearity, predict_phase_error
+from slviewer.fringe.response import (
+    gamma_from_harmonic,
+    measure_nonlinearity,
+    measure_second_harmonic,
+    predict_phase_error,
+)
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import (
     NEAR_DARK,

@@ -11,11 +11,12 @@ from facts import missing_facts
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
-from slviewer.calibration.diagnosis.frames import fit_mean_turn, gamma_from_harmonic
+from slviewer.calibration.diagnosis.frames import fit_mean_turn
 from slviewer.calibration.diagnosis.numbering import describe_misnumbering
 from slviewer.calibration.diagnosis.rules import judge_evidence
 from slviewer.calibration.known_camera import KnownCamera
 from slviewer.calibration.observe import Observation
+from slviewer.fringe.response import gamma_from_harmonic
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.records.record import from_plain, to_plain

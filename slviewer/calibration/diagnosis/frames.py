@@ -8,6 +8,7 @@ from slviewer.fringe.cosines import FEWEST, select_rows
 from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.origin import measure_code_origin
 from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.response import measure_second_harmonic
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.polynomial import fit_slopes
 from slviewer.geometry.rigid import Floats
@@ -38,32 +39,6 @@ def measure_axis(
         harmonic=measure_second_harmonic(sequence, stack, phase.axis),
         period_seen_px=measure_period(sequence, stack, phase.axis),
     )
-
-
-def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
-    """Return the amplitude of the finest fringe's second harmonic over the first, positive for a
-    gamma above 1.
-
-    NaN for fewer than five phase steps, which do not separate the two, and where too few pixels
-    have fringes.
-    """
-    layout = axis_layout(sequence, axis)
-    if layout.steps < 5:
-        return np.nan
-    indices = layout.shifts[-1].indices
-    rows = select_rows(*stack.shape[1:])
-    frames = np.stack([stack[i][rows].ravel() for i in indices])
-    white = white_level(sequence, stack, indices)
-    frames = frames[:, (frames.max(0) < white) & (frames.min(0) > 0)].astype(np.float32)
-    first, second = np.fft.fft(frames, axis=0)[1:3] * (2 / len(indices))
-    strength = np.abs(first)
-    weakest = 0.3 * np.quantile(strength, 0.95) if strength.size else np.inf
-    modulated = strength > max(8.0 * white / 255, weakest)
-    if np.count_nonzero(modulated) < FEWEST:
-        return np.nan
-    first, second, strength = first[modulated], second[modulated], strength[modulated]
-    along = np.real(second * np.conj(first / strength) ** 2)
-    return float(np.sum(along) / np.sum(strength))
 
 
 def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
@@ -143,16 +118,6 @@ def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np
     if layout.shifts:
         frames = list(layout.shifts[-1].indices)
     return np.asarray(stack[frames].mean(0, np.float32)) if frames else None
-
-
-def gamma_from_harmonic(harmonic: float) -> float:
-    """Return the exponent for which a power of a sinusoidal fringe has this ratio of second
-    harmonic to first.
-
-    Powers have ratios from -0.5 to 1; others are taken for the nearest of these.
-    """
-    harmonic = float(np.clip(harmonic, -0.49, 0.99))
-    return (1 + 2 * harmonic) / (1 - harmonic)
 
 
 def fit_mean_turn(

@@ -13,7 +13,6 @@ import numpy as np
 from msgspec import structs
 
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
-from slviewer.calibration.diagnosis.frames import gamma_from_harmonic
 from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY, CameraCheck, judge_camera
 from slviewer.calibration.observe import AXES
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
@@ -21,6 +20,7 @@ from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.squareness import judge_squareness, nearest_aspect
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, MIN_TILT_SPREAD_DEG
 from slviewer.examination.findings import mirroring_remedy
+from slviewer.fringe.response import gamma_from_harmonic
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import unit_vectors
