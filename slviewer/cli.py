@@ -181,7 +181,7 @@ def make_command(name: str) -> Function:
     commands = find_commands()
     if name not in commands:
         near = "".join(f" (did you mean {each}?)" for each in get_close_matches(name, commands, 1))
-        raise UsageError(f"unknown command {name}{near}: `slviewer --help` lists all commands")
+        raise UsageError(f"unknown command {name}{near}", "`slviewer --help` lists all commands")
     return commands[name]()
 
 
@@ -198,8 +198,8 @@ def _make_operation(name: str, source: str) -> Function:
         return read_operation(source)
     except Exception as error:  # whatever is wrong with a package
         raise UsageError(
-            f"{name}, of another package, cannot be used ({type(error).__name__}: {error}):"
-            " `slviewer plugins` shows why"
+            f"{name}, of another package, cannot be used ({type(error).__name__}: {error})",
+            "`slviewer plugins` shows why",
         ) from error
 
 

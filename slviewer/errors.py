@@ -31,9 +31,9 @@ class SlviewerError(Exception):
 
     def __init__(self, observation: str = "", remedy: str = "", place: str = "") -> None:
         super().__init__(observation, remedy, place)
-        self.observation, self.remedy, self.place = map(
-            hide_passwords, (observation, remedy, place)
-        )
+        # plugins may pass what is no text
+        parts = map(str, (observation, remedy, place))
+        self.observation, self.remedy, self.place = map(hide_passwords, parts)
 
     def __str__(self) -> str:
         return ": ".join(filter(None, (self.place, self.observation, self.remedy)))

@@ -1,8 +1,10 @@
-"""Messages hold no passwords."""
+"""Errors state what happened and what to do, and hold no passwords."""
+
+import pickle
 
 import pytest
 
-from slviewer.errors import DeviceError, hide_passwords
+from slviewer.errors import BoardError, DeviceError, InputError, hide_passwords
 
 
 @pytest.mark.parametrize(
@@ -27,3 +29,27 @@ def test_passwords_in_addresses_are_hidden(address: str) -> None:
 def test_other_text_stays_as_it_is() -> None:
     for text in ("http://127.0.0.1:8080/x", "me@example.org", "s3://bucket/a b@c", "1 @ 2"):
         assert hide_passwords(text) == text
+
+
+def test_an_error_is_its_place_observation_and_remedy() -> None:
+    error = InputError("2 frames of 18", "give one a pattern", "axis x")
+    assert str(error) == "axis x: 2 frames of 18: give one a pattern"
+    outer = error.within("scan_01")
+    assert str(outer) == f"scan_01: {error}" and outer.place == "scan_01: axis x"
+    assert (outer.observation, outer.remedy) == ("2 frames of 18", "give one a pattern")
+    assert error.place == "axis x"
+    assert outer.located_observation == "scan_01: axis x: 2 frames of 18"
+    assert str(InputError("no frames")) == "no frames" and InputError("no frames").remedy == ""
+
+
+def test_parts_of_an_error_hold_no_passwords() -> None:
+    address = "rtsp://u:hunter2@camera"
+    error = DeviceError(f"{address} is silent", f"open {address}", address)
+    assert not any("hunter2" in part for part in (error.observation, error.remedy, error.place))
+
+
+def test_an_error_survives_another_process() -> None:
+    error = pickle.loads(
+        pickle.dumps(BoardError("mirrored", "turn it", "a", cause="axis-reversed"))
+    )
+    assert str(error) == "a: mirrored: turn it" and error.cause == "axis-reversed"

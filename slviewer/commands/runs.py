@@ -199,7 +199,8 @@ def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
         if arguments["camera"] is not None:
             raise UsageError(
                 "--camera is where the calibration of a rig starts, and --camera-only makes such a"
-                " file: omit one of them"
+                " file",
+                "omit one of them",
             )
         from slviewer.pipeline.calibrate import calibrate_camera_alone
 
@@ -208,8 +209,8 @@ def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
         result = call(calibrate_camera_alone, source=source, out=out, **chosen)
     elif options.out is not None:
         raise UsageError(
-            "--out belongs to --camera-only: `slviewer export calibration` writes the rig's"
-            " calibration"
+            "--out belongs to --camera-only",
+            "`slviewer export calibration` writes the rig's calibration",
         )
     else:
         from slviewer.geometry.jit_prepare import Preparation
@@ -349,18 +350,18 @@ def run_frames(import_captures: Function, arguments: Arguments) -> None:
     if guess is None:
         if source is None or session is None:
             raise UsageError(
-                "SOURCE or SESSION is missing: give both, or --guess FOLDER for a TOML"
+                "SOURCE or SESSION is missing", "give both, or --guess FOLDER for a TOML"
             )
         if out is not None:
             raise UsageError(
-                "--out is the file for the TOML of --guess: give --guess FOLDER, or omit --out"
+                "--out is the file for the TOML of --guess", "give --guess FOLDER, or omit --out"
             )
         run_import("frames", import_captures, arguments)
         return
     if source is not None or sequence is not None:
         raise UsageError(
-            "--guess proposes a TOML and imports nothing: give it without SOURCE, SESSION,"
-            " --sequence"
+            "--guess proposes a TOML and imports nothing",
+            "give it without SOURCE, SESSION, --sequence",
         )
     guessed = guess_description(guess, arguments["projector"], arguments["channel"])
     if out is None:

@@ -324,7 +324,7 @@ def conclude_test(
     positions. Raises InputError where there is none."""
     if not positions:
         raise InputError(
-            f"no capture shows {artefact.name}: name some in [measured] captures of its file"
+            f"no capture shows {artefact.name}", "name some in [measured] captures of its file"
         )
     figures = [figure for position in positions for figure in position.figures]
     judgements, gaps = list[JudgedProperty](), dict[str, str]()
@@ -400,7 +400,7 @@ def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> StillCap
         )
     if count < LEAST_CAPTURES:
         raise InputError(
-            f"{count} captures show no repeatability: take {CAPTURES} of the same still object"
+            f"{count} captures show no repeatability", f"take {CAPTURES} of the same still object"
         )
     depths, noise = (np.stack(maps) for maps in zip(*pairs, strict=True))
     depths -= depths[0].copy()  # small, so that squares keep their digits
@@ -408,7 +408,7 @@ def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> StillCap
     always = np.isfinite(sigma)
     if not always.any():
         raise InputError(
-            "no pixel was measured in every capture: leave the object where it is, and in view"
+            "no pixel was measured in every capture", "leave the object where it is, and in view"
         )
     levels = depths[:, always].mean(axis=1, dtype=np.float64)
     return StillCaptures(

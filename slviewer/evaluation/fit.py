@@ -240,9 +240,10 @@ class ShapeSearch:
             shown = np.count_nonzero(region & agreeing)
             if shown < LEAST_PIXELS or shown < 0.5 * np.count_nonzero(region & measured):
                 raise InputError(
-                    f"The largest {'flat' if self.shape == 'plane' else 'round'} patch has"
-                    f" {shown} of {np.count_nonzero(measured)} measured pixels: check that the"
-                    " shape fills a good part of the view, and that the cloud is not mere noise."
+                    f"The largest {'flat' if self.shape == 'plane' else 'round'} patch has {shown}"
+                    f" of {np.count_nonzero(measured)} measured pixels",
+                    "check that the shape fills a good part of the view, and that the cloud is not"
+                    " mere noise.",
                 )
             if np.count_nonzero(patch ^ before) <= 1e-4 * np.count_nonzero(patch):
                 break
@@ -272,8 +273,8 @@ class ShapeSearch:
         chosen = points[evaluated].astype(np.float64)
         if len(chosen) < LEAST_POINTS:
             raise InputError(
-                f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are"
-                " needed."
+                f"{len(chosen)} points were measured in the region",
+                f"at least {LEAST_POINTS} are needed.",
             )
         fitted, is_inlier = fit_settled(lambda some, _: _FITS[self.shape](some), chosen, start)
         residuals = fitted.distance(chosen)
@@ -300,8 +301,8 @@ class ShapeSearch:
             return 0.0
         if self.sigma_z.shape != measured.shape:
             raise InputError(
-                f"The noise map has shape {self.sigma_z.shape} and the cloud {measured.shape}: they"
-                " must agree."
+                f"The noise map has shape {self.sigma_z.shape} and the cloud {measured.shape}",
+                "they must agree.",
             )
         known = self.sigma_z[measured & np.isfinite(self.sigma_z)]
         return float(np.median(known)) if known.size else 0.0
@@ -337,18 +338,18 @@ def measured_pixels(points: Points, mask: Map | None) -> Map:
     ``InputError`` if too few do."""
     if points.ndim != 3 or points.shape[2] != 3:
         raise InputError(
-            f"The cloud has shape {points.shape}: an organised cloud (h, w, 3) is needed."
+            f"The cloud has shape {points.shape}", "an organised cloud (h, w, 3) is needed."
         )
     if mask is not None and mask.shape != points.shape[:2]:
         raise InputError(
-            f"The mask has shape {mask.shape} and the cloud {points.shape[:2]}: they must agree."
+            f"The mask has shape {mask.shape} and the cloud {points.shape[:2]}", "they must agree."
         )
     measured = finite_rows(points)
     measured = measured if mask is None else measured & mask
     if np.count_nonzero(measured) < LEAST_PIXELS:
         raise InputError(
-            f"{np.count_nonzero(measured)} points were measured where the shape is looked for: at"
-            f" least {LEAST_PIXELS} are needed; check that it is in view and illuminated."
+            f"{np.count_nonzero(measured)} points were measured where the shape is looked for",
+            f"at least {LEAST_PIXELS} are needed; check that it is in view and illuminated.",
         )
     return measured
 
@@ -386,7 +387,7 @@ def incidence(
     z0, z1 = depth_range
     if not z0 < z1:
         raise InputError(
-            f"The depth range {z0:g} to {z1:g} mm is empty: give the smaller depth first."
+            f"The depth range {z0:g} to {z1:g} mm is empty", "give the smaller depth first."
         )
     z = points[..., 2][mask]
     z = z[np.isfinite(z)]
@@ -527,13 +528,13 @@ def fit_clouds(
     too few pixels.
     """
     if not clouds:
-        raise InputError("No cloud was given to evaluate: name at least one model.")
+        raise InputError("No cloud was given to evaluate", "name at least one model.")
     every, sigma_z = _merge_clouds(clouds)
     shared = np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
     if len(clouds) > 1 and region is None and np.count_nonzero(shared) < LEAST_PIXELS:
         raise InputError(
-            f"{' and '.join(clouds)} share {np.count_nonzero(shared)} measured pixels: name one"
-            " model, or place the shape where the board poses were."
+            f"{' and '.join(clouds)} share {np.count_nonzero(shared)} measured pixels",
+            "name one model, or place the shape where the board poses were.",
         )
     # A wall behind the shape may hold more pixels, in a model that measures everywhere.
     searched = region if region is not None else shared
@@ -588,8 +589,8 @@ def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
     sizes = {cloud.points.shape[:2] for cloud in clouds.values()}
     if len(sizes) > 1:
         raise InputError(
-            f"The models' clouds have different sizes, {sizes}: reconstruct them from the same"
-            " capture."
+            f"The models' clouds have different sizes, {sizes}",
+            "reconstruct them from the same capture.",
         )
     first, *others = clouds.values()
     points, sigma_z = first.points.copy(), first.sigma_z.copy()

@@ -87,7 +87,7 @@ def check_by_axes(name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]) ->
     lines, px. Raises InputError where too few pixels are decoded."""
     pixels, measured, sigma = sample_axes(phases)
     if len(pixels) < LEAST_PIXELS:
-        raise InputError(f"{name}: {len(pixels)} pixels decode along both axes: illuminate more")
+        raise InputError(f"{name}: {len(pixels)} pixels decode along both axes", "illuminate more")
     camera, projector = rig.camera.undistort(pixels), rig.projector.undistort(measured)
     depths = np.nan_to_num(ray_depths(rig, camera, projector)[:, 0])
     points = depths[:, None] * np.column_stack([camera, np.ones(len(camera))])
@@ -151,8 +151,9 @@ def check_by_sphere(name: str, rig: StereoRig, phase: PhaseMap, radius_mm: float
         fits[direction] = min(tried, key=lambda fit: (not fit.is_possible, fit.misfit))
     if all(np.isinf(fit.misfit) for fit in fits.values()):
         raise InputError(
-            f"{name}: no sphere of a radius of about {radius_mm:g} mm is in view, whatever R"
-            " and T mean: state the radius that was captured"
+            f"{name}: no sphere of a radius of about {radius_mm:g} mm is in view, whatever R and T"
+            " mean",
+            "state the radius that was captured",
         )
     return msgspec.structs.replace(_make_check(name, "sphere", fits), unit="mm")
 

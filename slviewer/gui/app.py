@@ -247,7 +247,7 @@ def rig_choice(text: str, session: Session | None = None) -> dict[str, Any]:
         return {"driver": name, "scale": float(scale or 0.5)}
     except ValueError:
         raise UsageError(
-            f"{text!r} is not a rig: write simulated, or simulated:0.25 for a quarter of the size"
+            f"{text!r} is not a rig", "write simulated, or simulated:0.25 for a quarter of the size"
         ) from None
 
 

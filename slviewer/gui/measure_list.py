@@ -531,7 +531,7 @@ class InspectionInputs(PanelPart):
     def _request_run(self) -> None:
         """Request that the chosen plan be run."""
         if not self._plan.value:
-            raise InputError("there is no plan yet: press Make plan, or upload one")
+            raise InputError("there is no plan yet", "press Make plan, or upload one")
         parts = self._scans if self._parts.value == ALL else [self._surface]
         self._operator.run_plan(self._plan.value, *parts)
 

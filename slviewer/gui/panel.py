@@ -90,7 +90,7 @@ class PanelContext:
     def session(self) -> Session:
         """The open session. Raises InputError where none is open."""
         if self.operator.session is None:
-            raise InputError("no session is open: open one first")
+            raise InputError("no session is open", "open one first")
         return self.operator.session
 
     def page_state(self, role: PageRole) -> PageState | None:

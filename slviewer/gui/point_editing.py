@@ -286,7 +286,7 @@ class PointEditing(PanelPart):
     def _require_scans(self) -> list[_EditedScan]:
         """Return the scans that are shown; InputError where none is."""
         if not self._scans:
-            raise InputError("no scan is shown: reconstruct one first")
+            raise InputError("no scan is shown", "reconstruct one first")
         return self._scans
 
     def _select_support(self) -> None:
@@ -325,7 +325,7 @@ class PointEditing(PanelPart):
             for scan in self._require_scans()
         ]
         if not any(each.selected.any() for each in selections):
-            raise InputError("no point is selected: select some first")
+            raise InputError("no point is selected", "select some first")
         if self._operator.delete_points(selections, " and ".join(self._what)):
             self._clear_selection()
 

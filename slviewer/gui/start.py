@@ -120,7 +120,7 @@ class StartPanel(StepPanel):
     def open_session(self, folder: Path | str) -> None:
         """Request a session, and leave the page where it is opened."""
         if not str(folder).strip():
-            raise InputError("no folder is named: enter that of a session")
+            raise InputError("no folder is named", "enter that of a session")
         if self._operator.open_session(folder):
             self._opened()
 
@@ -133,7 +133,7 @@ class StartPanel(StepPanel):
         """Move a session to the trash beside it."""
         session = self.snapshot.session
         if session and session.folder == folder:
-            raise InputError(f"{folder.name} is open: open another session, then delete it")
+            raise InputError(f"{folder.name} is open", "open another session, then delete it")
         place = self.context.recent.trash(folder)
         self._operator.notify("info", f"{folder.name} was moved to {place}")
 

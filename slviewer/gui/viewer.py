@@ -101,7 +101,7 @@ def show(what: Any, name: str = "", *, open_browser: bool | None = None) -> View
     points = shape.points.reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
-        raise InputError("No valid point to show: give a cloud with measured points.")
+        raise InputError("No valid point to show", "give a cloud with measured points.")
     viser_internals.check_version()
     server = viser_internals.start(_serve, "127.0.0.1", 0)
     server.gui.configure_theme(control_layout="floating")
@@ -165,8 +165,8 @@ def _find_shape(what: Any, name: str) -> Ply:
         case np.ndarray() if what.ndim in (2, 3) and what.shape[-1] == 3:
             return Ply(what, None, normals(what) if what.ndim == 3 else None)
     raise InputError(
-        f"{type(what).__name__} cannot be shown: give a cloud, points (..., 3), a mesh, a PLY file,"
-        " or a session and a scan."
+        f"{type(what).__name__} cannot be shown",
+        "give a cloud, points (..., 3), a mesh, a PLY file, or a session and a scan.",
     )
 
 

@@ -99,12 +99,12 @@ class BatchSettings(Callbacks):
     def __post_init__(self) -> None:
         if self.do == "verify" and self.shape is None:
             raise UsageError(
-                "what the captures show is not known: give --shape plane or --shape sphere"
+                "what the captures show is not known", "give --shape plane or --shape sphere"
             )
         if self.do != "verify" and (self.shape is not None or self.radius is not None):
             raise UsageError(f"--shape and --radius belong to --do verify, not to --do {self.do}")
         if not self.sessions:
-            raise UsageError("no session named: give the folders or addresses of one or more")
+            raise UsageError("no session named", "give the folders or addresses of one or more")
 
 
 @dataclass(frozen=True)
@@ -314,8 +314,8 @@ def _check_version(task: Task) -> None:
     worker's."""
     if task.version != __version__:
         raise InputError(
-            f"the worker runs slviewer {__version__}, the batch {task.version}: install the same on"
-            " both"
+            f"the worker runs slviewer {__version__}, the batch {task.version}",
+            "install the same on both",
         )
 
 
@@ -333,16 +333,16 @@ def connect(scheduler: str, timeout_s: float = CONNECT_TIMEOUT_S) -> Iterator[An
         client = Client(scheduler, timeout=timeout_s, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise SlviewerError(
-            f"no Dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`,"
-            " or leave --scheduler out to use this machine's cores"
+            f"no Dask scheduler answers at {scheduler} ({error})",
+            "start one with `dask scheduler`, or leave --scheduler out to use this machine's cores",
         ) from error
     with client:
         try:
             client.wait_for_workers(1, timeout=timeout_s)
         except TimeoutError as error:
             raise SlviewerError(
-                f"the scheduler at {scheduler} has no workers: start some with `dask worker"
-                f" {scheduler}`"
+                f"the scheduler at {scheduler} has no workers",
+                f"start some with `dask worker {scheduler}`",
             ) from error
         yield client
 
@@ -385,7 +385,7 @@ def _check_installed() -> None:
     for package in ("distributed", "fsspec", "cryptography"):
         if find_spec(package) is None:
             raise SlviewerError(
-                f"a batch needs the package {package}, which is missing: {INSTALL_COMMAND}"
+                f"a batch needs the package {package}, which is missing", INSTALL_COMMAND
             )
 
 
@@ -440,7 +440,7 @@ def _result_or_error(future: Any) -> Any:
         return "the scheduler was lost, or gave the work up"
     except ImportError as error:
         raise InputError(
-            f"the workers cannot run slviewer ({error}): install it where they are"
+            f"the workers cannot run slviewer ({error})", "install it where they are"
         ) from error
     except Exception as error:  # whatever a worker met with ends that capture alone
         return describe_error(error)
@@ -467,8 +467,8 @@ def _fetch_session(address: str, capture: str = "") -> Iterator[Path]:
     if not _is_remote(address):
         if not is_session(address):
             raise SessionError(
-                f"{address} is not a session folder where the worker is: give one that all workers"
-                " share, or an address"
+                f"{address} is not a session folder where the worker is",
+                "give one that all workers share, or an address",
             )
         yield Path(address)
         return
@@ -485,11 +485,11 @@ def _fetch_session(address: str, capture: str = "") -> Iterator[Path]:
                     fs.get_file(path, str(target))
         except OSError as error:
             raise SessionError(
-                f"{address} cannot be read ({error}): check the address and its permissions"
+                f"{address} cannot be read ({error})", "check the address and its permissions"
             ) from error
         if not is_session(folder):
             raise SessionError(
-                f"{address} is not a session (it holds no session.json): check the address"
+                f"{address} is not a session (it holds no session.json)", "check the address"
             )
         for inner in ("captures", "results"):
             Path(folder, inner).mkdir(exist_ok=True)
@@ -520,7 +520,7 @@ def export_folder(address: str, batch: str) -> Iterator[Path]:
             ) from error
         except OSError as error:
             raise SessionError(
-                f"{address} cannot be written ({error}): check its permissions and free space"
+                f"{address} cannot be written ({error})", "check its permissions and free space"
             ) from error
 
 
@@ -542,6 +542,6 @@ def _file_system(address: str) -> tuple[Any, str]:
         fs, root = url_to_fs(address)
     except (ImportError, ValueError) as error:
         raise InputError(
-            f"{address} cannot be reached ({error}): install what it needs where the workers are"
+            f"{address} cannot be reached ({error})", "install what it needs where the workers are"
         ) from error
     return fs, root.rstrip("/")

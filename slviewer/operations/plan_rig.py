@@ -184,7 +184,8 @@ def predict_rig(
     if coverage < 0.02:
         raise InputError(
             f"at {distance:g} mm the projector illuminates {100 * coverage:.0f} % of what the"
-            " camera sees: choose another distance, lens or baseline"
+            " camera sees",
+            "choose another distance, lens or baseline",
         )
     away = float(np.hypot(distance, baseline))
     camera_px, projector_px = distance / camera.focal_px, away / projector.focal_px[0]
@@ -452,11 +453,11 @@ class RigPlanSettings(Callbacks):
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise InputError(f"{name} = {value:g} is impossible: give {low:g} to {high:g}")
+                raise InputError(f"{name} = {value:g} is impossible", f"give {low:g} to {high:g}")
         if not 1 <= self.baseline_mm <= 3 * self.distance:
             raise InputError(
-                f"a baseline of {self.baseline_mm:g} mm is impossible at {self.distance:g} mm: give"
-                f" 1 to {3 * self.distance:g} mm"
+                f"a baseline of {self.baseline_mm:g} mm is impossible at {self.distance:g} mm",
+                f"give 1 to {3 * self.distance:g} mm",
             )
 
     @property
@@ -531,7 +532,7 @@ def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
     if view:
         if view[4] == "mm":
             raise InputError(
-                f"camera {text}: give the angle of view as 70deg, or a known camera with --lens"
+                f"camera {text}", "give the angle of view as 70deg, or a known camera with --lens"
             )
         what = f"{text}, noise as 2 Mpx machine vision"
         entry = {key: value for key, value in entry.items() if key not in ("pixel_um", "lens_mm")}
@@ -540,13 +541,13 @@ def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
     if "pixel_um" in entry:
         millimetres = entry["lens_mm"] if lens is None else lens
         if not 1 <= millimetres <= 1000:
-            raise InputError(f"a lens of {millimetres:g} mm is impossible: give 1 to 1000 mm")
+            raise InputError(f"a lens of {millimetres:g} mm is impossible", "give 1 to 1000 mm")
         focal, aperture = millimetres * 1000 / entry["pixel_um"], millimetres / entry["f_number"]
         what += f", lens {millimetres:g} mm at f/{entry['f_number']:g}"
     elif lens is not None:
         raise InputError(
-            "the lens of this camera is given by its angle of view: omit --lens, or name another"
-            " camera"
+            "the lens of this camera is given by its angle of view",
+            "omit --lens, or name another camera",
         )
     else:
         focal = width / 2 / np.tan(np.radians(entry["view_deg"]) / 2)
@@ -565,7 +566,7 @@ def _read_projector(text: str) -> tuple[PlannedProjector, str]:
         ratio, what = float(view[3]), f"{text}, as a common projector"
     if not 0.1 <= ratio <= 20:
         raise InputError(
-            f"a throw ratio of {ratio:g} is impossible: give distance over width, 0.1 to 20"
+            f"a throw ratio of {ratio:g} is impossible", "give distance over width, 0.1 to 20"
         )
     width, height = entry["size"]
     focal = (width * ratio, width * ratio / entry.get("row_pitch", 1.0))
@@ -582,7 +583,7 @@ def _read_device(
     if view := _VIEW.fullmatch(text):
         return {**known[typical], "size": [int(view[1]), int(view[2])]}, view
     if text not in known:
-        raise InputError(f"no {kind} is called {text!r}: use {', '.join(known)}, or {notation}")
+        raise InputError(f"no {kind} is called {text!r}", f"use {', '.join(known)}, or {notation}")
     return known[text], None
 
 

@@ -140,7 +140,7 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
     name, factor = chosen.name, scale_factor(store, chosen.name)
     if settings.apply_scale and certified.kind == "plane":
         raise InputError(
-            "the scale cannot be measured on a plane: apply that of a ball bar or a sphere"
+            "the scale cannot be measured on a plane", "apply that of a ball bar or a sphere"
         )
     captures: dict[str, str] = {}  # {capture: position, its own name where several are in one}
     for position, pattern in certified.positions.items():
@@ -187,7 +187,7 @@ def _measure_positions(
                 )
             )
         except InputError as error:
-            raise InputError(f"{name}: {error}") from error
+            raise error.within(name) from error
     return positions
 
 
@@ -197,7 +197,7 @@ def read_artefact(path: Path | str) -> Artefact:
     try:
         return Artefact.from_dict(given)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise error.within(str(path)) from error
 
 
 def _length_budget(
@@ -280,7 +280,7 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift] | Found[Tr
         yield Found("", check_imported(job, capture, settings.target, settings.radius))
         return
     if settings.target or settings.radius:
-        raise UsageError("--target and --radius are for imported calibrations: omit them")
+        raise UsageError("--target and --radius are for imported calibrations", "omit them")
     warn_of_calibration(store, job.warn)
     job.progress(0.0, f"reading {capture}")
     look = look_at_capture(shot)
@@ -338,11 +338,11 @@ def split_folds(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tup
     """
     if len(depths_mm) < LEAST_POSES:
         raise InputError(
-            f"{len(depths_mm)} target poses, and none can be spared of fewer than {LEAST_POSES}:"
-            " capture more poses to compare the models on poses that they were not made from"
+            f"{len(depths_mm)} target poses, and none can be spared of fewer than {LEAST_POSES}",
+            "capture more poses to compare the models on poses that they were not made from",
         )
     if folds < 2:
-        raise InputError(f"{folds} folds leave no pose out of any calibration: use 2 or more")
+        raise InputError(f"{folds} folds leave no pose out of any calibration", "use 2 or more")
     ordered = sorted(depths_mm, key=lambda name: depths_mm[name])
     count = min(folds, len(ordered))
     return tuple(tuple(ordered[k::count]) for k in range(count))
@@ -423,7 +423,7 @@ def gather_results(
     if not judged:
         why = "; ".join(f"{model}: {reason}" for model, reason in failed.items())
         raise InputError(
-            f"no model could be made without some of the poses ({why}): capture more poses"
+            f"no model could be made without some of the poses ({why})", "capture more poses"
         )
     models = {
         model: HeldOutError(
@@ -488,20 +488,20 @@ def validate(job: Job, settings: ValidateSettings) -> Iterator[Found[ModelCompar
     stereo = load_stereo(store)
     if not stereo.poses:
         raise InputError(
-            "this calibration was made elsewhere, without target poses: calibrate here to"
-            " cross-validate"
+            "this calibration was made elsewhere, without target poses",
+            "calibrate here to cross-validate",
         )
     names = [name for name in MODELS if name in (settings.models or available_models(store))]
     if not names:
         raise UsageError(
-            f"no model is called {', '.join(settings.models)}: use {', '.join(MODELS)}"
+            f"no model is called {', '.join(settings.models)}", f"use {', '.join(MODELS)}"
         )
     warn_of_calibration(store, job.warn)
     observations = load_observations(store, list(stereo.poses))
     if missing := sorted(set(stereo.poses) - {o.name for o in observations}):
         raise InputError(
-            f"the session no longer holds the observations of {', '.join(missing)}: run `slviewer"
-            " calibrate` again"
+            f"the session no longer holds the observations of {', '.join(missing)}",
+            "run `slviewer calibrate` again",
         )
     compared = cross_validate(
         move_to_centres(observations, stereo), stereo, names, settings.folds, job.progress
@@ -542,8 +542,9 @@ def cross_validate(
             )
         except CalibrationRejected as error:
             raise InputError(
-                f"without {', '.join(fold)} the rig cannot be calibrated, and no poses can be "
-                f"excluded from the fit ({error}): capture more poses"
+                f"without {', '.join(fold)} the rig cannot be calibrated, and no poses can be"
+                f" excluded from the fit ({error})",
+                "capture more poses",
             ) from error
         fitted: dict[str, Model] = {}
         for i, name in enumerate(n for n in models if n not in failed):

@@ -93,7 +93,7 @@ class AlignedPart:
         self.T_part_scan: np.ndarray = np.eye(4)
         self.spread: Uncertainty | None = None
         if not len(self._scan_points):
-            raise InputError(f"{surface.source} has no measured points: scan the part again.")
+            raise InputError(f"{surface.source} has no measured points", "scan the part again.")
         if nominal is not None:
             result = fit_to_nominal(surface, nominal)
             self._nominal_surface, self._area = result.surface, result.area
@@ -119,8 +119,8 @@ class AlignedPart:
         whose nearest place on it lies in the region."""
         if self._nominal_surface is None:
             raise InputError(
-                "A profile needs the nominal model: give its file as `nominal` of the plan's"
-                " alignment."
+                "A profile needs the nominal model",
+                "give its file as `nominal` of the plan's alignment.",
             )
         region = self.features[name].region
         inside = region.within(self.points)
@@ -210,8 +210,8 @@ class AlignedPart:
             self.T_part_scan = datum_frame([fit.feature for fit in fits]) @ self.T_part_scan
         if np.trace(self.T_part_scan[:3, :3] @ first[:3, :3].T) < 1.0:
             raise InputError(
-                "The datums turn the part by more than 90 degrees: place it as the plan's own part"
-                " lay."
+                "The datums turn the part by more than 90 degrees",
+                "place it as the plan's own part lay.",
             )
         middle = move_points(self.T_part_scan, self._scan_points).mean(axis=0)
         self.spread = datum_spread(fits, middle)
@@ -222,7 +222,7 @@ class AlignedPart:
         feature, T = self.features[name], self.T_part_scan
         if feature.kind == "surface":
             raise InputError(
-                f"{name} is a surface, which has a profile alone: choose a fitted feature."
+                f"{name} is a surface, which has a profile alone", "choose a fitted feature."
             )
         points = move_points(T, self._scan_points)
         points = points[feature.region.widened.within(points)]
@@ -230,7 +230,7 @@ class AlignedPart:
         try:
             fit = fit_feature(feature.kind, points, self.errors, feature.region, camera)
         except InputError as error:
-            raise InputError(f"{name}: {error}") from error
+            raise error.within(name) from error
         _refuse_unplanned(fit.feature, feature)
         towards = T[:3, 3] - fit.feature.place
         if as_planned and feature.direction is not None:
@@ -246,8 +246,8 @@ def _refuse_unplanned(found: Feature, planned: PlanFeature) -> None:
         if cosine < np.cos(np.radians(MAX_TURNED_DEG)):
             raise InputError(
                 f"{planned.name}: the {found.kind} in its region is turned by"
-                f" {np.degrees(np.arccos(cosine)):.0f} degrees from the plan's: see that the part"
-                " has it there, and scan what is missing of it."
+                f" {np.degrees(np.arccos(cosine)):.0f} degrees from the plan's",
+                "see that the part has it there, and scan what is missing of it.",
             )
     if planned.radius is None or found.radius is None:
         return
@@ -258,7 +258,8 @@ def _refuse_unplanned(found: Feature, planned: PlanFeature) -> None:
     if off > MAX_OFF_RADIUS * planned.radius:
         raise InputError(
             f"{planned.name}: the {found.kind} in its region is {off:.3g} mm off the plan's place"
-            " or radius: see that the part has it there, and scan what is missing of it."
+            " or radius",
+            "see that the part has it there, and scan what is missing of it.",
         )
 
 

@@ -125,7 +125,8 @@ class CalibrateSettings:
     def __post_init__(self) -> None:
         if self.fix_camera and self.camera is None:
             raise UsageError(
-                "--fix-camera keeps the lens of a file: name it with --camera, or omit --fix-camera"
+                "--fix-camera keeps the lens of a file",
+                "name it with --camera, or omit --fix-camera",
             )
 
     @property
@@ -272,7 +273,7 @@ def calibrate_frames(
     board = Board.parse(target)
     if not poses:
         raise InputError(
-            "no target pose was given: capture the board in at least three positions and tilts"
+            "no target pose was given", "capture the board in at least three positions and tilts"
         )
 
     judged = (
@@ -318,8 +319,8 @@ def _choose_poses(
     names = [capture.name for capture in captures if capture.role == "calibration"]
     if not names:
         raise InputError(
-            f"{store.folder} holds no target poses: import some with --role calibration, or capture"
-            " them first"
+            f"{store.folder} holds no target poses",
+            "import some with --role calibration, or capture them first",
         )
     excluded = {
         name: f"excluded by the operator: {why}"
@@ -334,7 +335,7 @@ def _choose_poses(
     excluded |= dict.fromkeys(skipped, "excluded for this calibration")
     names = [name for name in names if name not in excluded]
     if not names:
-        raise InputError("every target pose is excluded: include some again")
+        raise InputError("every target pose is excluded", "include some again")
     return names, excluded
 
 
@@ -536,7 +537,7 @@ def calibrate_camera_alone(
         there = images_by_name(source)
     else:
         raise InputError(
-            f"{source} is not a folder: give a folder of pictures of the board, or a session"
+            f"{source} is not a folder", "give a folder of pictures of the board, or a session"
         )
     pictures = {each.name: each for each in there}
     without = match_names([*pictures], exclude, "picture")
@@ -550,8 +551,8 @@ def calibrate_camera_alone(
         height, width = image.shape[:2]
         if size is not None and size != (width, height):
             raise InputError(
-                f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}: use pictures of"
-                " one size"
+                f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}",
+                "use pictures of one size",
             )
         size = width, height
         try:
@@ -560,7 +561,7 @@ def calibrate_camera_alone(
             excluded[name] = str(error)
             warn(f"{name} is excluded: {error}")
     if size is None:
-        raise InputError(f"{source} holds no picture to calibrate from: name some")
+        raise InputError(f"{source} holds no picture to calibrate from", "name some")
     calibration = calibrate_camera(board, detections, size, excluded)
     if out is not None:
         entries = {

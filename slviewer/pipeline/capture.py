@@ -102,7 +102,7 @@ class RigSettings(Callbacks):
         is_chosen = getattr(self, "auto_exposure", False)  # of a capture alone
         if (self.exposure_ms is not None) + bool(self.exposures_ms) + is_chosen > 1:
             raise InputError(
-                "the exposure was given in several ways: give one, several, or let it be chosen"
+                "the exposure was given in several ways", "give one, several, or let it be chosen"
             )
         _ = self.exposures
 
@@ -163,8 +163,8 @@ def capture(settings: CaptureSettings) -> Capture:
     with opened_or_made(settings.session) as store:
         if name in store.taken_names() and not settings.force:
             raise InputError(
-                f"there is a capture {name!r} already: choose another name, or replace it with"
-                " --force"
+                f"there is a capture {name!r} already",
+                "choose another name, or replace it with --force",
             )
         choice = load_rig(settings.rig, store)
         notation = settings.board or store.decision("target")
@@ -329,8 +329,8 @@ def check_space(store: Session, cameras: Sequence[Camera], frames: int, name: st
     if not space.enough:
         raise SessionError(
             f"{name} needs {format_bytes(space.capture_bytes or 0)}, and as much again for its"
-            f" results, and {format_bytes(space.free_bytes)} are free on {store.folder}: free some"
-            " space first"
+            f" results, and {format_bytes(space.free_bytes)} are free on {store.folder}",
+            "free some space first",
         )
 
 
@@ -407,7 +407,7 @@ class TurnSettings(RigSettings):
         super().__post_init__()
         if self.mesh is not None and not self.merge:
             raise UsageError(
-                "a mesh is made of the merged scans: give --mesh or --no-merge, not both"
+                "a mesh is made of the merged scans", "give --mesh or --no-merge, not both"
             )
 
 
@@ -429,7 +429,7 @@ def turn(settings: TurnSettings) -> Turn:
         turn_name = todo[0].turn
         choice = load_rig(settings.rig, store)
         if choice.get("driver") == "replay":
-            raise InputError("a recording cannot be turned: choose a rig with a turntable")
+            raise InputError("a recording cannot be turned", "choose a rig with a turntable")
         bench, sequence = set_up_rig(store, choice, None, settings)
         require_turntable(bench.rig)
         place_object(bench)
@@ -471,7 +471,7 @@ def _list_steps(store: Session, settings: TurnSettings) -> list[TurnStep]:
         steps = plan_turn(settings.name or next_turn(store), settings.steps, settings.range_deg)
     if taken := set(store.taken_names()).intersection(step.name for step in steps):
         raise InputError(
-            f"there is a capture {min(taken)!r} already: choose another name, or resume the turn"
+            f"there is a capture {min(taken)!r} already", "choose another name, or resume the turn"
         )
     return steps
 
@@ -483,11 +483,11 @@ def plan_turn(name: str, steps: int = STEPS, range_deg: float = FULL_TURN_DEG) -
     Raises InputError for a number of steps or a range that cannot be scanned and merged.
     """
     if not 2 <= steps <= MOST_SCANS:
-        raise InputError(f"{steps} steps make no turn: choose 2 to {MOST_SCANS}")
+        raise InputError(f"{steps} steps make no turn", f"choose 2 to {MOST_SCANS}")
     if not 0 < abs(range_deg) <= FULL_TURN_DEG:
         raise InputError(
-            f"a turn of {range_deg:g} degrees is impossible: choose up to 360, negative the"
-            " other way"
+            f"a turn of {range_deg:g} degrees is impossible",
+            "choose up to 360, negative the other way",
         )
     safe_name(f"{name}_{steps:02d}")
     step_deg = range_deg / (steps if abs(range_deg) == FULL_TURN_DEG else steps - 1)
@@ -516,13 +516,13 @@ def missing_steps(store: Session, name: str | None = None) -> list[TurnStep]:
         name = turns[-1] if turns else ""
     recorded = recorded_steps(store, name)
     if not recorded:
-        raise InputError(f"there is no turn {name or 'yet'} to resume: begin a new one")
+        raise InputError(f"there is no turn {name or 'yet'} to resume", "begin a new one")
     first, taken = recorded[0], set(store.taken_names())
     steps = [replace(first, step=k) for k in range(1, first.steps + 1)]
     if missing := [step for step in steps if step.name not in taken]:
         return missing
     raise InputError(
-        f"all {first.steps} steps of {name} are captured: delete a scan to capture it again"
+        f"all {first.steps} steps of {name} are captured", "delete a scan to capture it again"
     )
 
 

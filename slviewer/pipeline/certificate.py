@@ -220,26 +220,26 @@ def read_certificate(path: Path) -> tuple[str, Certificate]:
         page = read_file(path, _MAX_REPORT_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path} cannot be read ({error}): give a report that slviewer wrote"
+            f"{path} cannot be read ({error})", "give a report that slviewer wrote"
         ) from error
     _, content, _ = split_page(page, CERTIFICATE)
     if content is None:
         raise InputError(
-            f"{path.name} holds no certificate: write the report again with this version of"
-            " slviewer"
+            f"{path.name} holds no certificate",
+            "write the report again with this version of slviewer",
         )
     if len(content) > MAX_JSON_BYTES:
         raise InputError(
-            f"the certificate in {path.name} is longer than any: write the report again"
+            f"the certificate in {path.name} is longer than any", "write the report again"
         )
     try:
         certificate = msgspec.json.decode(html.unescape(content), type=Certificate)
     except (msgspec.DecodeError, RecursionError) as error:
         raise InputError(
-            f"the certificate in {path.name} is damaged ({error}): write the report again"
+            f"the certificate in {path.name} is damaged ({error})", "write the report again"
         ) from error
     if certificate.schema > SCHEMA:
-        raise InputError(f"{path.name} was written by a newer slviewer: update slviewer")
+        raise InputError(f"{path.name} was written by a newer slviewer", "update slviewer")
     return page, certificate
 
 
@@ -344,8 +344,8 @@ class _Repetition:
                 record = load_record(self.store, all_kinds()[kind], name)
                 if record.operation not in OPERATIONS:
                     raise InputError(
-                        "an older version of slviewer made it: make it again, and write the report"
-                        " again"
+                        "an older version of slviewer made it",
+                        "make it again, and write the report again",
                     )
                 _check_restrictions(self.store, record)
                 run = record.operation, to_json(record.settings)

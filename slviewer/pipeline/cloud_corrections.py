@@ -81,8 +81,9 @@ def record_scale(store: Session, acceptance: AcceptanceTest) -> float:
     if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:  # False for NaN
         raise InputError(
             f"the scale factor would be {factor:.6g}, which is not a correction (at most"
-            f" {LARGEST_FACTOR:g}): check the certificate's length, temperature and expansion, and"
-            " that its captures show this artefact"
+            f" {LARGEST_FACTOR:g})",
+            "check the certificate's length, temperature and expansion, and that its captures show"
+            " this artefact",
         )
     meta = {
         "factor": factor,
@@ -123,13 +124,14 @@ def parse_region(roi: str) -> RegionOfInterest:
         return _read_region(expand_user(roi))
     if len(numbers) != 6 or not np.isfinite(numbers).all():
         raise UsageError(
-            f"--roi has {len(numbers)} numbers, six are needed: x0,x1,y0,y1,z0,z1 in mm, {_EXAMPLE}"
+            f"--roi has {len(numbers)} numbers, six are needed",
+            f"x0,x1,y0,y1,z0,z1 in mm, {_EXAMPLE}",
         )
     low, high = numbers[::2], numbers[1::2]
     if any(a >= b for a, b in zip(low, high, strict=True)):
         raise UsageError(
-            f"--roi {roi} ends before it begins: give the lower number of each axis first,"
-            f" {_EXAMPLE}"
+            f"--roi {roi} ends before it begins",
+            f"give the lower number of each axis first, {_EXAMPLE}",
         )
     return RegionOfInterest.between(low, high)
 
@@ -147,8 +149,8 @@ def restrict_cloud(store: Session, scan: str, cloud: C, region: RegionOfInterest
     measured = int(np.count_nonzero(np.isfinite(points).all(axis=-1)))
     if measured and not kept.any():
         raise InputError(
-            f"{scan}: all of its {measured} points were deleted by {history.applied} edits: undo"
-            f" some, with `slviewer edit SESSION {scan} --undo 1` or in the step Scan"
+            f"{scan}: all of its {measured} points were deleted by {history.applied} edits",
+            f"undo some, with `slviewer edit SESSION {scan} --undo 1` or in the step Scan",
         )
     if region is not None:
         kept &= crop_mask(scan, np.where(kept[..., None], points, np.nan), region)
@@ -183,6 +185,7 @@ def _read_region(path: Path) -> RegionOfInterest:
         return from_plain(read_toml(path), RegionOfInterest)
     except InputError as error:
         raise InputError(
-            f"{path} states no region ({error}): write centre_mm = [x, y, z], size_mm = [x, y, z]"
-            " and, for a turned box, rotation_deg = [x, y, z]"
+            f"{path} states no region ({error})",
+            "write centre_mm = [x, y, z], size_mm = [x, y, z] and, for a turned box, rotation_deg ="
+            " [x, y, z]",
         ) from error

@@ -85,8 +85,8 @@ class CompareSettings:
     def __post_init__(self) -> None:
         if self.out is not None and Path(self.out).suffix.lower() != ".ply":
             raise UsageError(
-                f"coloured points are written as .ply, not as {Path(self.out).name}: end its"
-                " name so"
+                f"coloured points are written as .ply, not as {Path(self.out).name}",
+                "end its name so",
             )
 
 

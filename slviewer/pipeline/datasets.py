@@ -70,7 +70,8 @@ def fetch(
             " assets/make_sample_data.py letter"
         )
         raise InputError(
-            f"no data set is called {name!r}: use {' or '.join(known)}{also * (name == 'letter')}"
+            f"no data set is called {name!r}",
+            f"use {' or '.join(known)}{also * (name == 'letter')}",
         )
     dataset = known[name]
     if folder is None:
@@ -80,7 +81,7 @@ def fetch(
     else:
         target = Path(folder)
         if target.exists():
-            raise InputError(f"{target} exists: give the name of a new folder")
+            raise InputError(f"{target} exists", "give the name of a new folder")
     if dataset.url:
         source = _download(name, dataset, part(progress, 0.0, 0.8))
     else:
@@ -123,8 +124,9 @@ def _download(name: str, dataset: Dataset, progress: Progress) -> Path:
         )
     except requests.RequestException as error:
         raise InputError(
-            f"{dataset.url} was not downloaded ({type(error).__name__}): check the network, or"
-            " download it elsewhere and unpack it; the data set 'sample' needs no network"
+            f"{dataset.url} was not downloaded ({type(error).__name__})",
+            "check the network, or download it elsewhere and unpack it; the data set 'sample' needs"
+            " no network",
         ) from error
     except ValueError as error:  # pooch: the hash differs
         raise InputError(

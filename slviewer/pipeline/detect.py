@@ -138,7 +138,7 @@ def detect_board(
         done, data = cv2.imencode(overlay.suffix, draw_detection(board, picture, detection))
         if not done:
             raise InputError(
-                f"{overlay.name} cannot be written as an image: give a name that ends in .png"
+                f"{overlay.name} cannot be written as an image", "give a name that ends in .png"
             )
         replace_file(overlay, data.tobytes())
     detected = BoardsDetected(board, tuple(results))
@@ -195,15 +195,16 @@ def _list_photographs(given: list[Path]) -> list[Path]:
             )
             if not inside:
                 raise InputError(
-                    f"{path} holds no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files"
+                    f"{path} holds no images",
+                    f"name a folder with {', '.join(IMAGE_SUFFIXES)} files",
                 )
             paths += inside
         elif path.exists():
             paths.append(path)
         else:
-            raise InputError(f"{path} does not exist: name image files, or a folder of them")
+            raise InputError(f"{path} does not exist", "name image files, or a folder of them")
     if not paths:
-        raise InputError("no image was named: name image files, or a folder of them")
+        raise InputError("no image was named", "name image files, or a folder of them")
     return paths
 
 

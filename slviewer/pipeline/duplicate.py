@@ -29,7 +29,7 @@ def duplicate_calibration(source: Path | str, target: Path) -> list[str]:
     """
     with Session.open(source) as old:
         if not available_models(old):
-            raise InputError(f"{old.folder.name} has no calibration: calibrate it first")
+            raise InputError(f"{old.folder.name} has no calibration", "calibrate it first")
         if target.exists():
             layout.new_folder(target)  # states what is there
         poses = old.capture_names("calibration")

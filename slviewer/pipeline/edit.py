@@ -99,7 +99,7 @@ class EditSettings(Callbacks):
         requests = (self.polygon, self.part, self.support, self.undo, self.redo)
         if sum(map(bool, requests)) > 1:
             raise UsageError(
-                "do one thing at a time: --polygon, --part, --support, --undo or --redo"
+                "do one thing at a time", "--polygon, --part, --support, --undo or --redo"
             )
         if (self.invert and not self.selects) or (self.margin is not None and not self.support):
             raise UsageError(
@@ -107,12 +107,12 @@ class EditSettings(Callbacks):
             )
         if self.part and len(self.part) != 2:
             raise UsageError(
-                f"--part has {len(self.part)} numbers: give u v of one pixel, such as --part"
-                " 180 150"
+                f"--part has {len(self.part)} numbers",
+                "give u v of one pixel, such as --part 180 150",
             )
         if self.polygon and (len(self.polygon) % 2 or len(self.polygon) < 6):
             raise UsageError(
-                f"--polygon has {len(self.polygon)} numbers: give u v of three or more pixels"
+                f"--polygon has {len(self.polygon)} numbers", "give u v of three or more pixels"
             )
 
     @property
@@ -141,8 +141,8 @@ def edit_scan(settings: EditSettings) -> ScanEdits:
             cloud, plane = scan_cloud(settings.job(store), scan, settings.model), None
             if cloud.normals is not None:
                 raise InputError(
-                    f"{scan} was imported as a cloud, whose points are not those of pixels: cut it"
-                    " with --roi where it is used, or before it is imported"
+                    f"{scan} was imported as a cloud, whose points are not those of pixels",
+                    "cut it with --roi where it is used, or before it is imported",
                 )
             if settings.support:
                 plane, selected = select_support(cloud.points, cloud.sigma_z, settings.margin)
@@ -187,11 +187,12 @@ def delete_points(store: Session, selections: Sequence[Selection], what: str) ->
         edit = make_edit(each.points, each.selected, what, each.plane, made)
         if edit.points == (total := int(np.count_nonzero(measured))):
             raise InputError(
-                f"all {total} points of {each.scan} are selected: select fewer, or delete the scan"
+                f"all {total} points of {each.scan} are selected",
+                "select fewer, or delete the scan",
             )
         edits[each.scan] = edit
     if not edits:
-        raise InputError("no point is selected: select some first")
+        raise InputError("no point is selected", "select some first")
     with store.together():
         for scan, edit in edits.items():
             save_edits(store, scan, load_edits(store, scan).add(edit))
@@ -259,7 +260,7 @@ def set_region(
     """
     if roi and around:
         raise UsageError(
-            "state the region with --roi, or take it from a scan with --around: one of both"
+            "state the region with --roi, or take it from a scan with --around", "one of both"
         )
     with opened(session, write=bool(roi or around)) as store:
         region = load_region(store, even_if_off=True)
@@ -272,7 +273,7 @@ def set_region(
             region = parse_region(roi)
         elif roi == "on" and region is None:
             raise InputError(
-                "the session has no region of interest yet: state its box, or use --around SCAN"
+                "the session has no region of interest yet", "state its box, or use --around SCAN"
             )
         if roi or around:
             save_region(store, region, roi != OFF)

@@ -206,8 +206,8 @@ def write_coefficients(store: Session, name: str, path: Path) -> str:
     there = [model for model in ("pixelwise", "splined") if model in available_models(store)]
     if not (name or there) or name == "stereo":
         raise InputError(
-            "only the pixelwise and the splined model have coefficients for each pixel: calibrate"
-            " these"
+            "only the pixelwise and the splined model have coefficients for each pixel",
+            "calibrate these",
         )
     model = load_model(store, name or there[0])
     entries: dict[str, Any] = {"scale_factor": scale_factor(store, model.name)}
@@ -316,7 +316,7 @@ def write_table(store: Session, path: Path) -> None:
                 for row in table.rows
             ]
     if not rows:
-        raise InputError("nothing was found yet: verify, reconstruct or merge captures first")
+        raise InputError("nothing was found yet", "verify, reconstruct or merge captures first")
     titles = list(dict.fromkeys(title for row in rows for title in row))
     lines = ([row.get(title) for title in titles] for row in rows)
     replace_file(path, format_csv([titles, *lines]).encode())
@@ -366,7 +366,7 @@ def formats(what: What) -> tuple[str, ...]:
         return mesh_formats()
     if what in _DOCUMENT_FORMATS:
         return _DOCUMENT_FORMATS[what]
-    raise InputError(f"{what!r} cannot be exported: choose one of {', '.join(get_args(What))}")
+    raise InputError(f"{what!r} cannot be exported", f"choose one of {', '.join(get_args(What))}")
 
 
 @dataclass(frozen=True)
@@ -407,7 +407,7 @@ def check_export(what: What, file_format: str) -> None:
     """Raise InputError for something that cannot be exported, or not in this format."""
     if _ALIASES.get(file_format, file_format) not in formats(what):
         listed = ", ".join(f".{each}" for each in formats(what))
-        raise InputError(f"the {what} cannot be written as .{file_format}: choose {listed}")
+        raise InputError(f"the {what} cannot be written as .{file_format}", f"choose {listed}")
 
 
 def default_file_name(what: What, name: str, file_format: str) -> str:
@@ -498,8 +498,8 @@ def _write_shape(store: Session, name: str, target: Path, settings: ExportSettin
         cloud = scan_cloud(job, name, settings.model, settings.roi)
         if not (mask := cloud.mask).any():
             raise InputError(
-                f"{name}: no pixel was measured: does the calibration belong to this camera and"
-                " projector?"
+                f"{name}: no pixel was measured",
+                "does the calibration belong to this camera and projector?",
             )
         whose, model = name, cloud.model
         origin = f"scan {name}, frame: {frame_of(store, model)}, x right, y down, z away"

@@ -305,8 +305,8 @@ def _choose_layout(
     known = layouts()
     if layout not in known:
         raise InputError(
-            f"the layout {layout!r} is unknown: use"
-            f" {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
+            f"the layout {layout!r} is unknown",
+            f"use {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}",
         )
     if layout != "frames":
         return known[layout]
@@ -314,7 +314,7 @@ def _choose_layout(
         return replace(known[layout], read=partial(known[layout].read, toml=Path(toml)))
     if same is None:
         raise InputError(
-            f"{source} holds no TOML that describes the images: add one, or give --sequence"
+            f"{source} holds no TOML that describes the images", "add one, or give --sequence"
         )
     warn("the images are described as those of the session: --sequence to describe them")
     return same
@@ -483,8 +483,8 @@ def import_opencv_calibration(
         there = available_models(store)
         if there and not force:
             raise InputError(
-                f"{store.folder} holds a {' and a '.join(there)} calibration already: "
-                "replace it with --force (it goes to the session's trash)"
+                f"{store.folder} holds a {' and a '.join(there)} calibration already",
+                "replace it with --force (it goes to the session's trash)",
             )
         captures = store.captures(with_frames=True)
         others = {capture.other_size for capture in captures} - {None}
@@ -540,14 +540,14 @@ def _resolve_size(
             f"{width}x{height} px by {source}" for source, (width, height) in sources.items()
         )
         raise InputError(
-            f"the {device} has {conflict}: the calibration does not belong to these captures, or"
-            " one size is wrong"
+            f"the {device} has {conflict}",
+            "the calibration does not belong to these captures, or one size is wrong",
         )
     size = next(iter(sources.values()), None)
     if len(captured) > 1 and size not in captured:
         raise InputError(
-            f"the session's captures have several {device} sizes: give the calibrated one with"
-            f" --{device}"
+            f"the session's captures have several {device} sizes",
+            f"give the calibrated one with --{device}",
         )
     return size
 

@@ -59,7 +59,7 @@ class ImportCloudSettings(Callbacks):
 
     def __post_init__(self) -> None:
         if not self.files:
-            raise UsageError("no file named: give one or more clouds to import")
+            raise UsageError("no file named", "give one or more clouds to import")
 
 
 @takes_settings(ImportCloudSettings)
@@ -76,7 +76,9 @@ def import_cloud(settings: ImportCloudSettings) -> Findings[Reconstruction]:
             try:
                 for capture, record, arrays in _make_scans(file, settings):
                     if capture.name in made:
-                        raise InputError(f"two files give a scan {capture.name!r}: rename {file}")
+                        raise InputError(
+                            f"two files give a scan {capture.name!r}", f"rename {file}"
+                        )
                     store.save_captures([capture], "scan", force=settings.force)
                     inputs = store.input_hashes(capture.name)
                     made[capture.name] = msgspec.structs.replace(record, inputs=inputs)

@@ -172,7 +172,7 @@ def _check_on_board(
     off_px = np.inf if points is None else np.median(lengths(camera.project(points) - pixels))
     if points is None or off_px > REFUSED_PX:
         raise InputError(
-            f"{name}: the board is {off_px:.1f} px beside where the camera's matrix can have it:"
-            " check the board's notation, and the matrix and distortion of the camera"
+            f"{name}: the board is {off_px:.1f} px beside where the camera's matrix can have it",
+            "check the board's notation, and the matrix and distortion of the camera",
         )
     return check_by_board(name, rig, points, observation.projector)

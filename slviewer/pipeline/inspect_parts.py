@@ -227,12 +227,12 @@ def list_sessions(folders: Sequence[Path]) -> list[Path]:
         inner = [folder] if is_session(folder) else sorted(filter(is_session, folder.glob("*")))
         if not inner:
             raise UsageError(
-                f"{folder} is not a session and holds none: give session folders, or a folder of"
-                " them"
+                f"{folder} is not a session and holds none",
+                "give session folders, or a folder of them",
             )
         listed += inner
     if not listed:
-        raise UsageError("no session named: give the folders of one or more")
+        raise UsageError("no session named", "give the folders of one or more")
     return listed
 
 
@@ -246,7 +246,7 @@ def match_parts(store: Session, patterns: Sequence[str]) -> list[str]:
     if wanted:
         names = match_names(names, wanted, "scan", InputError)
     elif not names:
-        raise InputError("it holds no scan: scan the part first")
+        raise InputError("it holds no scan", "scan the part first")
     return [*names, *merges]
 
 
@@ -329,11 +329,11 @@ def plan(
     """
     if not LEAST_TOLERANCE_MM <= tolerance <= MOST_TOLERANCE_MM:
         raise UsageError(
-            f"--tolerance is {tolerance:g}: give {LEAST_TOLERANCE_MM:g} to {MOST_TOLERANCE_MM:g}"
-            f" mm, by default {TOLERANCE_MM:g}"
+            f"--tolerance is {tolerance:g}",
+            f"give {LEAST_TOLERANCE_MM:g} to {MOST_TOLERANCE_MM:g} mm, by default {TOLERANCE_MM:g}",
         )
     if datums and nominal is not None:
-        raise UsageError("--datums and --nominal were given: choose one way to align")
+        raise UsageError("--datums and --nominal were given", "choose one way to align")
     with opened(session) as store:
         job = Job(store, progress, warn)
         made = make_plan(job, tolerance, Path(out).stem, datums or (), nominal)
@@ -400,7 +400,7 @@ def _select_fits(
     fits = [each for each in measured if each.record.what in FORM_OF and not each.stale]
     if not fits:
         raise InputError(
-            "nothing was fitted in this session: fit planes, spheres or cylinders to a scan first"
+            "nothing was fitted in this session", "fit planes, spheres or cylinders to a scan first"
         )
     last = fits[-1].record.source
     if len(sources := {each.record.source for each in fits}) > 1:

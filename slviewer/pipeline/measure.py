@@ -111,15 +111,15 @@ class MeasuredSurface:
         """The point at a pixel or index, and its uncertainty. Raises InputError without one."""
         if self.organised != isinstance(place, tuple):
             raise InputError(
-                f"{place} is not a place on {self.source}: give"
-                f" {'pixel (u, v)' if self.organised else 'an index'}"
+                f"{place} is not a place on {self.source}",
+                f"give {'pixel (u, v)' if self.organised else 'an index'}",
             )
         index = place[::-1] if isinstance(place, tuple) else (place,)
         if not all(0 <= i < n for i, n in zip(index, self.points.shape, strict=False)):
-            raise InputError(f"{place} lies outside {self.source}: pick a point of it")
+            raise InputError(f"{place} lies outside {self.source}", "pick a point of it")
         point = np.asarray(self.points[index], np.float64)
         if not np.isfinite(point).all():
-            raise InputError(f"nothing was measured at {place} of {self.source}: pick another")
+            raise InputError(f"nothing was measured at {place} of {self.source}", "pick another")
         away, sigma = np.zeros(3), float(np.nan_to_num(self.sigma_mm[index]))
         if self.organised:
             away = sigma * point / point[2]
@@ -150,7 +150,7 @@ def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
     if on.faces is not None:
         return np.asarray(on.points, np.float64), on.faces
     if not on.organised:
-        raise InputError(f"{on.source} is a cloud without triangles: mesh it first")
+        raise InputError(f"{on.source} is a cloud without triangles", "mesh it first")
     return on.points[on.measured].astype(np.float64), triangulate_grid(on.points)
 
 
@@ -278,8 +278,8 @@ class MeasureSettings:
     def __post_init__(self) -> None:
         if self.what in FITTED and (len(self.ball), len(self.box)) not in ((4, 0), (0, 6)):
             raise UsageError(
-                f"a {self.what} needs its region: give --ball x y z radius, or --box x y z x y z,"
-                " in mm"
+                f"a {self.what} needs its region",
+                "give --ball x y z radius, or --box x y z x y z, in mm",
             )
         if self.what not in FITTED and len(self.at) not in (self.ends, 2 * self.ends):
             raise self._place_error(organised=True)
@@ -403,7 +403,7 @@ def _cut(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     if on.organised or on.faces is not None:
         vertices, faces = triangulate_surface(on)
     elif on.normals is None:
-        raise InputError(f"{on.source} has neither triangles nor normals: merge the scans again")
+        raise InputError(f"{on.source} has neither triangles nor normals", "merge the scans again")
     else:
         vertices, faces = triangulate_near(on.points, on.normals, plane)
     lines = section(vertices, faces, plane)
@@ -447,10 +447,10 @@ def relate(job: Job, settings: RelateSettings) -> Iterator[Found[Measurement]]:
     store = job.store
     first, second = (load_stored(store, Measurement, each) for each in (settings.a, settings.b))
     if settings.a == settings.b:
-        raise InputError(f"{first.label} was chosen twice: choose two measurements")
+        raise InputError(f"{first.label} was chosen twice", "choose two measurements")
     if stale := [each.label for each in (first, second) if each.stale]:
         raise InputError(
-            f"{stale[0]} is stale, what it was measured on has changed: measure it again"
+            f"{stale[0]} is stale, what it was measured on has changed", "measure it again"
         )
     features = (*load_feature(store, first), *load_feature(store, second))
     a, b = first.record, second.record
@@ -459,7 +459,8 @@ def relate(job: Job, settings: RelateSettings) -> Iterator[Found[Measurement]]:
     if a.source != b.source and (a.model != b.model or not (a.model and scans)):
         raise InputError(
             f"{first.label} was measured on {a.source} with {a.model}, {second.label} on {b.source}"
-            f" with {b.model}: they do not lie in one frame; measure both on one surface"
+            f" with {b.model}",
+            "they do not lie in one frame; measure both on one surface",
         )
     record = Measurement(
         what="relation",
@@ -480,7 +481,7 @@ def load_feature(store: Session, measured: Stored[Measurement]) -> tuple[Feature
     found = measured.record.feature
     if found is None:
         raise InputError(
-            f"{measured.label} is a {measured.record.what}: choose one of {', '.join(KINDS)}"
+            f"{measured.label} is a {measured.record.what}", f"choose one of {', '.join(KINDS)}"
         )
     shared = load_arrays(store, _FOLDER + measured.name).get("shared")
     if shared is not None:
@@ -495,7 +496,7 @@ def section_lines(session: SessionLike, name: str) -> tuple[CutPlane, list[np.nd
         measured = load_stored(store, Measurement, name)
         if measured.record.plane is None:
             raise InputError(
-                f"{measured.label} is a {measured.record.what}, not a section: choose a section"
+                f"{measured.label} is a {measured.record.what}, not a section", "choose a section"
             )
         arrays = load_arrays(store, _FOLDER + name)
     lines = np.split(arrays["lines"].astype(np.float64), np.cumsum(arrays["lengths"])[:-1])
@@ -526,7 +527,7 @@ def export_measurements(store: Session, out: Path | str) -> int:
     """Write all measurements to a CSV file; returns how many it holds."""
     out = Path(out)
     if out.suffix.lower() != ".csv":
-        raise InputError(f"{out.name} is not a table: end its name in .csv")
+        raise InputError(f"{out.name} is not a table", "end its name in .csv")
     found = list_records(store, Measurement)
     replace_file(out.absolute(), format_measurements(found).encode("utf-8-sig"))
     return len(found)
@@ -556,7 +557,7 @@ def restore_measurement(store: Session) -> Stored[Measurement]:
     """Bring the measurement back that was deleted last. Raises InputError where there is none."""
     deleted = [each for each in store.deleted_results() if each.startswith(_FOLDER)]
     if not deleted:
-        raise InputError("no measurement was deleted, so none can be restored: measure again")
+        raise InputError("no measurement was deleted, so none can be restored", "measure again")
     store.restore_last(deleted[0])
     return load_stored(store, Measurement, deleted[0].removeprefix(_FOLDER))
 

@@ -150,16 +150,16 @@ class MergeSettings:
 
     def __post_init__(self) -> None:
         if len(self.names) < 2:
-            raise UsageError(f"only {self.reference} was named: name the scans to merge with it")
+            raise UsageError(f"only {self.reference} was named", "name the scans to merge with it")
         if self.out is not None and Path(self.out).suffix.lower() != ".ply":
             raise UsageError(
-                f"merged points are written as .ply, not as {Path(self.out).name}: a mesh goes"
-                " into other files too"
+                f"merged points are written as .ply, not as {Path(self.out).name}",
+                "a mesh goes into other files too",
             )
         if self.angle is not None and self.start != "turntable":
             raise UsageError(
-                "an angle from scan to scan is that of a turntable: give --start turntable too, or"
-                " neither"
+                "an angle from scan to scan is that of a turntable",
+                "give --start turntable too, or neither",
             )
         self.fit_picks()
 
@@ -284,9 +284,9 @@ def _check_markers(measured: Mapping[str, MeasuredMarkers], warn: Warn) -> None:
     if not any(one & other for i, one in enumerate(numbers) for other in numbers[:i]):
         counts = ", ".join(f"{name} {len(markers.ids)}" for name, markers in measured.items())
         raise InputError(
-            f"no two scans show the same marker (measured: {counts}): print some by `slviewer"
-            " target markers:0-23:20`, put them on or beside the object so that neighbouring scans"
-            " share three or more, and scan again; or start from features"
+            f"no two scans show the same marker (measured: {counts})",
+            "print some by `slviewer target markers:0-23:20`, put them on or beside the object so"
+            " that neighbouring scans share three or more, and scan again; or start from features",
         )
 
 
@@ -402,13 +402,14 @@ def _list_table_angles(store: Session, settings: MergeSettings) -> dict[str, flo
     table_deg = {name: step.deg for name, step in stored.items() if step is not None}
     if missing := [name for name in names if name not in table_deg]:
         raise UsageError(
-            f"no angle of a turntable is stored with {', '.join(missing)}: give the angle from scan"
-            " to scan, or start from features"
+            f"no angle of a turntable is stored with {', '.join(missing)}",
+            "give the angle from scan to scan, or start from features",
         )
     if len(turns := dict.fromkeys(step.turn for step in stored.values() if step is not None)) > 1:
         raise UsageError(
             f"the scans belong to several turns ({', '.join(turns)}), between which the object may"
-            " have been moved: start from features"
+            " have been moved",
+            "start from features",
         )
     return table_deg
 
@@ -423,8 +424,8 @@ def _initial_alignments(
         placed = load_placements(job.store)
         if missing := [name for name in names if name not in placed]:
             raise InputError(
-                f"{' and '.join(missing)} were not aligned: align them first, or start from"
-                " features"
+                f"{' and '.join(missing)} were not aligned",
+                "align them first, or start from features",
             )
         poses = {name: np.array(placed[name].T_first_scan) for name in names}
     elif settings.start == "identity":

@@ -125,22 +125,22 @@ class MeshSettings(Callbacks):
     def __post_init__(self) -> None:
         sources = self.sources
         if not sources:
-            raise UsageError("nothing was named: name one scan, several to merge, or a merge")
+            raise UsageError("nothing was named", "name one scan, several to merge, or a merge")
         if len(sources) > 1 and any(name.startswith(MERGED) for name in sources):
-            raise UsageError("a merge is meshed by itself: name one merge, or scans")
+            raise UsageError("a merge is meshed by itself", "name one merge, or scans")
         if len(sources) > 1 and self.plan is not None and self.plan.method == "grid":
             raise UsageError(
-                "the method grid joins the pixels of one scan: name one, or use poisson or volume"
+                "the method grid joins the pixels of one scan", "name one, or use poisson or volume"
             )
         if self.out is not None:
             suffix = Path(self.out).suffix.lower()
             check_export("mesh", suffix.removeprefix("."))
             if self.texture is not None and suffix not in (".glb", ".obj"):
                 raise UsageError(
-                    f"{Path(self.out).name} holds no texture: end its name in .glb or .obj"
+                    f"{Path(self.out).name} holds no texture", "end its name in .glb or .obj"
                 )
         if self.white and self.texture is None:
-            raise UsageError("--white balances the colours of a texture: give --texture too")
+            raise UsageError("--white balances the colours of a texture", "give --texture too")
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -240,7 +240,7 @@ def _balance_cloud(name: str, cloud: Cloud, gains: np.ndarray) -> Cloud:
     colours."""
     if cloud.texture is None or cloud.texture.ndim != 3:
         raise InputError(
-            f"the picture of {name} has no colours: make the texture without a white balance"
+            f"the picture of {name} has no colours", "make the texture without a white balance"
         )
     return replace(cloud, texture=balance(cloud.texture, gains))
 
@@ -257,8 +257,8 @@ def measure_white(store: Session, reference: str) -> np.ndarray:
     captures = [capture for capture in store.captures("calibration") if capture.texture is not None]
     if not captures:
         raise InputError(
-            "the target poses have no colours, so that the board's white is unknown: capture them"
-            " with a colour camera and a white image, or name a capture of a grey card"
+            "the target poses have no colours, so that the board's white is unknown",
+            "capture them with a colour camera and a white image, or name a capture of a grey card",
         )
     gains, refusals = list[np.ndarray](), list[str]()
     for capture in captures:
@@ -283,7 +283,7 @@ def _measure_gains(store: Session, capture: Capture) -> np.ndarray:
     texture = capture.texture
     if texture is None:
         raise InputError(
-            f"{capture.name} has no colours: name a capture of a colour camera with a white image"
+            f"{capture.name} has no colours", "name a capture of a colour camera with a white image"
         )
     texture = to_eight_bits(texture, capture.sequence.full_scale)
     if observed := load_observations(store, [capture.name]):  # a target pose: its board
@@ -299,13 +299,13 @@ def _measure_gains(store: Session, capture: Capture) -> np.ndarray:
     if len(usable) < len(white) / 2:
         share = 100 * (1 - len(usable) / len(white))
         raise InputError(
-            f"{share:.0f} % of the white in {capture.name} is overexposed: lower the exposure"
+            f"{share:.0f} % of the white in {capture.name} is overexposed", "lower the exposure"
         )
     colour = np.median(usable, axis=0)
     if colour.min() < DARKEST or colour.max() > MAX_GAIN * colour.min():
         levels = ", ".join(f"{level:.0f}" for level in colour)
         raise InputError(
-            f"the white in {capture.name} has {levels} grey levels of red, green and blue: expose"
-            f" it so that each has {DARKEST} or more, none {MAX_GAIN:g} times another"
+            f"the white in {capture.name} has {levels} grey levels of red, green and blue",
+            f"expose it so that each has {DARKEST} or more, none {MAX_GAIN:g} times another",
         )
     return np.asarray(colour.min() / colour)

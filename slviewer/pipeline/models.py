@@ -131,7 +131,7 @@ def save_imported_stereo(
 def load_stereo(store: Session) -> StereoModel:
     """Load the session's stereo calibration, without its residual arrows."""
     if "stereo" not in available_models(store):
-        raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
+        raise InputError(f"{store.folder} holds no calibration", "run `slviewer calibrate` first")
     return store.decode_result(
         "calibration/stereo", lambda meta, _: _decode_stereo(store, meta), only=()
     )
@@ -177,7 +177,8 @@ def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:
     captures = store.captures(with_frames=True)
     if not captures and not (meta["camera"] and meta["projector"]):
         raise SessionError(
-            f"{store.folder} holds no capture that states the camera's size: import the scans first"
+            f"{store.folder} holds no capture that states the camera's size",
+            "import the scans first",
         )
     camera = tuple(meta["camera"] or captures[0].size)
     projector = tuple(meta["projector"] or captures[0].other_size or captures[0].sequence.projector)
@@ -251,8 +252,8 @@ def load_model(store: Session, name: str | None) -> Model:
     if name not in available_models(store):
         there = ", ".join(available_models(store))
         raise InputError(
-            f"{store.folder} holds no {name} calibration"
-            f" (there is {there or 'none'}): run `slviewer calibrate` first"
+            f"{store.folder} holds no {name} calibration (there is {there or 'none'})",
+            "run `slviewer calibrate` first",
         )
     if name == "stereo":
         return load_stereo(store)
@@ -271,8 +272,8 @@ def _load_cached(
     with decoding(
         result,
         lambda fault: SessionError(
-            f"{result} in {store.folder} was saved by another version of slviewer, or"
-            f" {fault}: run `slviewer calibrate` again"
+            f"{result} in {store.folder} was saved by another version of slviewer, or {fault}",
+            "run `slviewer calibrate` again",
         ),
     ):
         model = kind.from_arrays(meta["model"], arrays)
@@ -349,7 +350,7 @@ def _recommend(store: Session) -> tuple[str, str]:
     without any."""
     there = available_models(store)
     if not there:
-        raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
+        raise InputError(f"{store.folder} holds no calibration", "run `slviewer calibrate` first")
     compared = store.decode_fresh(
         "validation/1", lambda meta, _: read_record(ModelComparison, meta), only=()
     )

@@ -242,8 +242,8 @@ def read_stored_poses(
             (a, b), (c, d) = (map(_wxh, each) for each in (own, others))
             other = "second camera" if capture.second else "projector"
             raise InputError(
-                f"{capture.name} has a {a} camera and a {b} {other}, {first.name} {c} and {d}:"
-                " calibrate poses of one rig at one resolution"
+                f"{capture.name} has a {a} camera and a {b} {other}, {first.name} {c} and {d}",
+                "calibrate poses of one rig at one resolution",
             )
     cached = {name: load_judged(store, name, board, smoothing) for name in names}
     missing = [capture for capture in captures if cached[capture.name] is None]

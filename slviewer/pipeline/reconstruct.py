@@ -118,8 +118,8 @@ class ReconstructSettings:
         for path, suffix in ((self.out, ".ply"), (self.grid, ".npy")):
             if path is not None and Path(path).suffix.lower() != suffix:
                 raise InputError(
-                    f"{path}: a cloud is written as .ply (--out), its whole grid as .npy (--grid):"
-                    f" end its name in {suffix}; `slviewer export` writes other formats"
+                    f"{path}: a cloud is written as .ply (--out), its whole grid as .npy (--grid)",
+                    f"end its name in {suffix}; `slviewer export` writes other formats",
                 )
 
 
@@ -173,8 +173,9 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
     mask = written.mask if region is None else written.mask & region
     if not mask.any():
         raise InputError(
-            f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong"
-            " to this camera and projector, and is the scene within its depths?"
+            f"{capture}: no pixel could be reconstructed with {name}",
+            "does the calibration belong to this camera and projector, and is the scene within its"
+            " depths?",
         )
     job.progress(0.8, "writing")
     points = int(np.count_nonzero(mask))
@@ -269,11 +270,11 @@ class VerifySettings:
     def __post_init__(self) -> None:
         if not self.captures:
             raise UsageError(
-                "no capture named: give the captures to measure, for instance plane_01 plane_02"
+                "no capture named", "give the captures to measure, for instance plane_01 plane_02"
             )
         if self.depth_range is not None and not 0 < self.depth_range[0] < self.depth_range[1]:
             near, far = self.depth_range
-            raise UsageError(f"the range {near:g} {far:g} is empty: give near and far in mm")
+            raise UsageError(f"the range {near:g} {far:g} is empty", "give near and far in mm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +352,7 @@ def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCap
                 radius=settings.radius,
             )  # fmt: skip
         except InputError as error:
-            raise InputError(f"{shot.name}: {error}") from error
+            raise error.within(shot.name) from error
         for message in found.warnings:
             job.warn(f"{shot.name}: {message}")
         masked = {
@@ -450,8 +451,8 @@ def absolute_phases(
     whose = "" if depth_range else ", the calibrated depths"
     if near_far is None:
         raise InputError(
-            f"{name}: its phase is not absolute, and the calibration knows no depths: state those"
-            " of the scene with --depth-range NEAR FAR, mm"
+            f"{name}: its phase is not absolute, and the calibration knows no depths",
+            "state those of the scene with --depth-range NEAR FAR, mm",
         )
     absolute, refusals = dict[Axis, PhaseMap](), list[str]()
     for axis, phase in phases.items():
@@ -513,7 +514,7 @@ def scan_cloud(job: Job, name: str, model: str | None = None, roi: str = "") -> 
     region = resolve_region(store, roi)
     capture, fresh = store.load_capture(name), is_up_to_date(store, stored)
     if capture.is_imported_cloud and not fresh:
-        raise InputError(f"the points of {name} are missing: import its file again with --force")
+        raise InputError(f"the points of {name} are missing", "import its file again with --force")
     meta = store.load_meta(stored) if fresh else {}
     if meta and (capture.is_imported_cloud or model in (None, "", meta["model"])):
         names = set(meta["arrays"]) - {"phase", "modulation"}
@@ -532,7 +533,7 @@ def merge_name(store: Session, name: str) -> str:
     does not exist."""
     there = numbered_names(store, "merge")
     if not there:
-        raise InputError("there is no merge yet: merge scans first")
+        raise InputError("there is no merge yet", "merge scans first")
     if name and name not in there:
         raise InputError(f"there is no merge {name!r}: the merges are {', '.join(there)}")
     return name or there[-1]
@@ -544,8 +545,8 @@ def read_merge(store: Session, result: str, warn: Warn, roi: str = "") -> tuple[
     made."""
     if roi:
         raise UsageError(
-            f"{result} was cut by the region when its scans were merged: merge them again with"
-            f" --roi {roi}"
+            f"{result} was cut by the region when its scans were merged",
+            f"merge them again with --roi {roi}",
         )
     if not is_up_to_date(store, result):
         warn(f"{result} came from scans or a calibration that have changed since: merge again")
@@ -559,7 +560,7 @@ def points_with_normals(merged: Ply) -> PointSet:
     """Return the points of a merge whose normals are known, to make a mesh of; InputError for a
     merge without any."""
     if merged.normals is None:
-        raise InputError("the merged cloud has no normals: merge the scans again")
+        raise InputError("the merged cloud has no normals", "merge the scans again")
     known, sigma = np.isfinite(merged.normals).all(axis=1), merged.scalars.get("sigma")
     if sigma is not None and not np.isfinite(sigma[known]).all():
         sigma = None

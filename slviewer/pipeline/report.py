@@ -131,7 +131,7 @@ def report(settings: ReportSettings) -> str:
     annex."""
     out, progress = settings.out, settings.progress
     if Path(out).suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{out} is not an HTML file: end its name in .html")
+        raise InputError(f"{out} is not an HTML file", "end its name in .html")
     changed = settings.changed_details()
     with opened(settings.session, write=bool(changed)) as store:
         if changed:

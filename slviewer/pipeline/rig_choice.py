@@ -119,7 +119,7 @@ def reel(
             f" {', '.join(names) or 'none'}"
         )
     if not recorded:
-        raise InputError(f"{folder} holds no capture to play back: name a folder that does")
+        raise InputError(f"{folder} holds no capture to play back", "name a folder that does")
     return Reel([each for each in recorded if capture in (None, each.name)])
 
 
@@ -162,14 +162,14 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
         if (turning := choice.get("turntable")) is not None:
             if dict(turning)["driver"] == "simulated" and bench.world is None:
                 raise InputError(
-                    "a simulated turntable turns only what is before the simulated rig: choose"
-                    " another"
+                    "a simulated turntable turns only what is before the simulated rig",
+                    "choose another",
                 )
             table = _make_device("turntable", turning, world=bench.world)
         settle_ms = float(choice.get("settle_ms", 0.0)) or bench.rig.settle_ms
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"the rig {dict(choice)} cannot be set up ({error}): choose it again"
+            f"the rig {dict(choice)} cannot be set up ({error})", "choose it again"
         ) from error
     return replace(
         bench,
@@ -188,7 +188,7 @@ def place_object(bench: RigSetup) -> None:
 def require_turntable(rig: Rig) -> Turntable:
     """Return the rig's turntable. Raises InputError where it has none."""
     if rig.turntable is None:
-        raise InputError(f"the rig {rig.name} has no turntable: add [turntable] to its file")
+        raise InputError(f"the rig {rig.name} has no turntable", "add [turntable] to its file")
     return rig.turntable
 
 
@@ -199,7 +199,7 @@ def _make_device(part: str, chosen: Choice, **provided: Any) -> Any:
     named = driver(str(options.pop("driver")))
     make = driver_factory(named, part)
     if make is None:
-        raise InputError(f"the driver {named.name} offers no {part}: choose another")
+        raise InputError(f"the driver {named.name} offers no {part}", "choose another")
     taken = _list_provided(named) & inspect.signature(make).parameters.keys() & provided.keys()
     return make(**options, **{name: provided[name] for name in taken})
 
@@ -246,7 +246,7 @@ def _simulated_setup(
     view, and one camera or two; ``dlpc350``: its projector is a LightCrafter 4500 that triggers the
     camera, if that is one."""
     if preset != "letter":
-        raise InputError(f"no rig preset is called {preset!r}: use letter")
+        raise InputError(f"no rig preset is called {preset!r}", "use letter")
     rig = letter(scale, seed)
     world = SimulatedWorld(rig, board)
     if thing != "board":
@@ -311,12 +311,12 @@ def load_rig(rig: RigLike, session: Session | None = None) -> dict[str, Any]:
         named = {preset.name: preset.source for preset in presets(session)}
         if path.suffix.lower() == ".toml":
             raise InputError(
-                f"there is no file {path}: name a TOML file that describes a rig, or one of"
-                f" {', '.join(named)}"
+                f"there is no file {path}",
+                f"name a TOML file that describes a rig, or one of {', '.join(named)}",
             )
         if name not in named:
             raise InputError(
-                f"no rig is called {name!r}: use {', '.join(named)}, or name a TOML file"
+                f"no rig is called {name!r}", f"use {', '.join(named)}, or name a TOML file"
             )
         path = named[name]
     choice = _read_preset(name, path).choice
@@ -344,27 +344,28 @@ def check_choice(choice: Choice, where: str) -> None:
             or (not value and key != "settle_ms")
         ):
             raise InputError(
-                f"{where}: {key} = {value!r} is not a number above 0, up to {largest:g}: correct it"
+                f"{where}: {key} = {value!r} is not a number above 0, up to {largest:g}",
+                "correct it",
             )
     name = choice.get("name", "")
     if not isinstance(name, str) or not name.isprintable():
-        raise InputError(f"{where}: name = {name!r} is not text that can be printed: correct it")
+        raise InputError(f"{where}: name = {name!r} is not text that can be printed", "correct it")
     if "turntable" in choice:
         _check_device(choice, "turntable", where)
     if "driver" in choice:
         given = _options_of_rig(choice)
         if set(_PARTS) & set(given):
             raise InputError(
-                f"{where} names a driver of a whole rig and a camera or a projector: remove one of"
-                " both"
+                f"{where} names a driver of a whole rig and a camera or a projector",
+                "remove one of both",
             )
         _check_options(given, "rig", where)
         return
     unknown = sorted(set(choice) - {*COMMON_KEYS, *_PARTS})
     if unknown:
         raise InputError(
-            f"{where} has the unknown key {unknown[0]!r}: use {', '.join(_PARTS)},"
-            f" {', '.join(COMMON_KEYS)}"
+            f"{where} has the unknown key {unknown[0]!r}",
+            f"use {', '.join(_PARTS)}, {', '.join(COMMON_KEYS)}",
         )
     for part in ("camera", "projector"):
         _check_device(choice, part, where)
@@ -378,7 +379,7 @@ def _check_device(choice: Choice, part: str, where: str) -> None:
     device = choice.get(part)
     if not isinstance(device, Mapping) or "driver" not in device:
         rather = "" if part == "turntable" else ", or a driver of a rig"
-        raise InputError(f'{where} names no {part}: add [{part}] with driver = "…"{rather}')
+        raise InputError(f"{where} names no {part}", f'add [{part}] with driver = "…"{rather}')
     _check_options(device, "camera" if part == "second" else part, f"{where}, {part}")
 
 
@@ -387,7 +388,7 @@ def _read_preset(name: str, path: Path) -> Preset:
     choice = read_toml(path)
     what = choice.pop("what", "")
     if not isinstance(what, str):
-        raise InputError(f"{path}: what = {what!r} is not text: correct it")
+        raise InputError(f"{path}: what = {what!r} is not text", "correct it")
     check_choice(choice, str(path))
     return Preset(name, what, choice, path)
 
@@ -401,11 +402,11 @@ def _check_options(chosen: Choice, part: str, where: str) -> None:
         offering = sorted(d.name for d in drivers().values() if driver_factory(d, part))
         why = DRIVER_PLUGINS.explain_missing(name)
         raise InputError(
-            f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}{why}"
+            f"{where}: no driver is called {name!r}", f"use one of {', '.join(offering)}{why}"
         )
     make = driver_factory(drivers()[name], part)
     if make is None:
-        raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
+        raise InputError(f"{where}: the driver {name} offers no {part}", "choose another")
     parameters = inspect.signature(make, eval_str=True).parameters
     if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
         return
@@ -413,10 +414,10 @@ def _check_options(chosen: Choice, part: str, where: str) -> None:
     known = {key: each for key, each in parameters.items() if key not in provided}
     if unknown := sorted(options.keys() - known.keys()):
         use = f"use {', '.join(known)}" if known else "it takes none"
-        raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}: {use}")
+        raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}", use)
     for key, each in known.items():
         if key not in options and each.default is each.empty:
-            raise InputError(f"{where}: the driver {name} needs {key}: add it")
+            raise InputError(f"{where}: the driver {name} needs {key}", "add it")
     for key, value in options.items():
         _check_type(f"{where}: {key} = {value!r}", value, known[key].annotation)
 
@@ -425,12 +426,12 @@ def _check_type(stated: str, value: Any, kind: Any) -> None:
     """Raise InputError where an option is not of the type of the driver's parameter, or no number
     that is finite."""
     if isinstance(value, float) and not isfinite(value):
-        raise InputError(f"{stated} is not a number: correct it")
+        raise InputError(f"{stated} is not a number", "correct it")
     try:
         with suppress(TypeError):  # a path, which the driver checks itself
             msgspec.convert(value, Any if kind is inspect.Parameter.empty else kind)
     except msgspec.ValidationError as error:
-        raise InputError(f"{stated} is of the wrong type ({error}): correct it") from error
+        raise InputError(f"{stated} is of the wrong type ({error})", "correct it") from error
 
 
 def _driver_names(choice: Choice) -> list[str]:

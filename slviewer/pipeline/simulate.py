@@ -66,9 +66,11 @@ def simulate(
     (axis x).
     """
     if preset not in get_args(Preset):
-        raise InputError(f"no rig preset is called {preset!r}: use {' or '.join(get_args(Preset))}")
+        raise InputError(
+            f"no rig preset is called {preset!r}", f"use {' or '.join(get_args(Preset))}"
+        )
     if not MIN_POSES <= poses <= 200:
-        raise InputError(f"{poses} target poses cannot be simulated: choose {MIN_POSES} to 200")
+        raise InputError(f"{poses} target poses cannot be simulated", f"choose {MIN_POSES} to 200")
     board = Board.parse(TARGET)
     rig = letter(scale, seed)
     plan = turn_plan(rig, board, poses) if preset == "turn" else letter_plan(rig, board, poses)

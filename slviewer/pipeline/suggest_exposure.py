@@ -126,7 +126,7 @@ def suggest_exposure(
     InputError for a region or time that is impossible; and whatever `progress` raises.
     """
     if not budget_s > 0:
-        raise InputError(f"a capture of {budget_s:g} s is impossible: give a time above 0")
+        raise InputError(f"a capture of {budget_s:g} s is impossible", "give a time above 0")
     before = rig.camera.settings()
     bracket = _Bracket(rig, sequence, region, budget_s, progress)
     try:
@@ -160,7 +160,8 @@ class _Bracket:
         if not (0 <= x < width and 0 <= y < height and across > 0 and down > 0):
             raise InputError(
                 f"the region {x} {y} {across} {down} is outside of the image of {width}x{height}"
-                " px: give x, y, width and height in px"
+                " px",
+                "give x, y, width and height in px",
             )
         inside = np.zeros((height, width), bool)
         inside[y : y + down, x : x + across] = True
@@ -186,14 +187,14 @@ class _Bracket:
             low, high, lit = self._examine(current_ms)
         if np.count_nonzero(lit) < max(50, _FEW * np.count_nonzero(self._inside)):
             raise DeviceError(
-                "no pixel sees the patterns in any exposure: check that the projector lights what"
-                " the camera sees"
+                "no pixel sees the patterns in any exposure",
+                "check that the projector lights what the camera sees",
             )
         chosen = self._choose(low[lit], high[lit])
         if not chosen:
             raise DeviceError(
-                f"no capture of {self._frames} frames fits into {self.budget_s:g} s: allow more"
-                " time, or choose patterns with fewer frames"
+                f"no capture of {self._frames} frames fits into {self.budget_s:g} s",
+                "allow more time, or choose patterns with fewer frames",
             )
         for _ in range(_CORRECTIONS):
             chosen = self._applied(chosen)
@@ -253,8 +254,8 @@ class _Bracket:
             set_ms = self.rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
         if set_ms is None:
             raise DeviceError(
-                f"{self.rig.camera.name} does not report its exposure: set it by hand, at the"
-                " camera"
+                f"{self.rig.camera.name} does not report its exposure",
+                "set it by hand, at the camera",
             )
         if set_ms in self._looks:
             return self._looks[set_ms]

@@ -98,7 +98,8 @@ def measure_markers(cloud: Cloud) -> MeasuredMarkers:
     without a texture."""
     if cloud.texture is None:
         raise InputError(
-            "A cloud without a texture shows no markers: reconstruct the capture with its texture."
+            "A cloud without a texture shows no markers",
+            "reconstruct the capture with its texture.",
         )
     grey = (
         cloud.texture

@@ -126,11 +126,13 @@ def register_all(
     """
     if reference not in scans:
         raise InputError(
-            f"There is no scan called {reference!r}: choose the reference among {', '.join(scans)}."
+            f"There is no scan called {reference!r}",
+            f"choose the reference among {', '.join(scans)}.",
         )
     if not 2 <= len(scans) <= MOST_SCANS:
         raise InputError(
-            f"{len(scans)} scan(s) given: registering takes 2 to {MOST_SCANS} scans of one object."
+            f"{len(scans)} scan(s) given",
+            f"registering takes 2 to {MOST_SCANS} scans of one object.",
         )
     return _PoseGraphBuilder(
         scans, reference, starts or Starts(), progress or (lambda share: None)
@@ -336,9 +338,10 @@ class _PoseGraphBuilder:
         points = choose_pixels(cloud.points, trusted)
         if len(points) < LEAST_POINTS <= measured:
             raise InputError(
-                f"{name} has {measured} points, and all but {len(points)} lie beside holes"
-                " or depth steps: the cloud is too sparse or too noisy to be aligned; capture it"
-                " with more light and longer exposure, or with more phase steps"
+                f"{name} has {measured} points, and all but {len(points)} lie beside holes or depth"
+                " steps",
+                "the cloud is too sparse or too noisy to be aligned; capture it with more light and"
+                " longer exposure, or with more phase steps",
             )
         facing = choose_pixels(grid_normals(cloud.points), trusted)
         prepared = prepare_scan(name, points, facing, sigma_mm)

@@ -47,8 +47,8 @@ def open3d() -> Any:
     except (ImportError, OSError) as error:
         package = "open3d-cpu" if sys.platform == "linux" else "open3d"
         raise SlviewerError(
-            f"Open3D, which aligns scans and casts rays, cannot be imported ({error}): "
-            f"run 'pip install {package} libusb-package' in the environment that runs slviewer."
+            f"Open3D, which aligns scans and casts rays, cannot be imported ({error})",
+            f"run 'pip install {package} libusb-package' in the environment that runs slviewer.",
         ) from error
     # Open3D brings a TBB older than numba wants; numba then takes another threading layer, and need
     # not say so

@@ -140,33 +140,34 @@ def prepare_scan(
     ``InputError`` for points that cannot be used.
     """
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
+        raise InputError(f"The {name} has shape {points.shape}", "give its valid points as (n, 3).")
     if len(points) < LEAST_POINTS:
         raise InputError(
-            f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it."
+            f"The {name} has {len(points)} points",
+            f"at least {LEAST_POINTS} are needed to align it.",
         )
     if not np.isfinite(points).all():
         raise InputError(
-            f"The {name} holds points that are not finite: exclude its invalid pixels first."
+            f"The {name} holds points that are not finite", "exclude its invalid pixels first."
         )
     if normals is not None and normals.shape != points.shape:
         raise InputError(
-            f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one"
-            " each."
+            f"The {name} has {len(points)} points and normals of shape {normals.shape}",
+            "give one each.",
         )
     points = np.ascontiguousarray(points, dtype=np.float64)
     size = measure_size(points)
     if not size > 0:
         raise InputError(
-            f"Nearly all points of the {name} are one: give those that were measured, each once."
+            f"Nearly all points of the {name} are one", "give those that were measured, each once."
         )
     voxel = FINEST_MM * scale_of(size)
     fine = _make_cloud(points, normals, voxel, has_camera)
     if len(fine.points) < LEAST_POINTS // 5:
         raise InputError(
             f"Nearly all of the {len(points)} points of the {name} are seen at grazing angles or"
-            f" have no normal ({len(fine.points)} places are left): turn the object towards the"
-            " camera."
+            f" have no normal ({len(fine.points)} places are left)",
+            "turn the object towards the camera.",
         )
     spacing = median_spacing(cKDTree(np.asarray(fine.points)), 2000)
     spacing /= np.sqrt(len(points) / len(fine.points))

@@ -169,15 +169,15 @@ def fit_picked_start(
     p, q = np.asarray(scan_points, dtype=np.float64), np.asarray(reference_points, dtype=np.float64)
     if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:
         raise InputError(
-            f"Picked points of shapes {p.shape} and {q.shape} are not pairs: pick as many on both"
-            " scans."
+            f"Picked points of shapes {p.shape} and {q.shape} are not pairs",
+            "pick as many on both scans.",
         )
     if len(p) < LEAST_PICKS:
         raise InputError(
-            f"{len(p)} point pairs were picked: pick {LEAST_PICKS} or more, well apart."
+            f"{len(p)} point pairs were picked", f"pick {LEAST_PICKS} or more, well apart."
         )
     if not (np.isfinite(p).all() and np.isfinite(q).all()):
-        raise InputError("A picked point lies where nothing was measured: pick on the surface.")
+        raise InputError("A picked point lies where nothing was measured", "pick on the surface.")
     for name, points in (("scan", p), ("reference", q)):
         extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if not extents[1] > _THIN * extents[0] or not extents[0] > 0:
@@ -241,9 +241,9 @@ def fit_turntable_axis(steps: Sequence[Floats], step_deg: ArrayLike) -> Turntabl
     given = np.broadcast_to(np.asarray(step_deg, np.float64), len(steps))
     if unfit := [deg for deg in given if not determines_axis(deg)]:
         raise InputError(
-            f"A turntable's step of {unfit[0]:g} degrees gives no axis: step by"
-            f" {MAX_ANGLE_ERROR_DEG:g} to {180 - MAX_ANGLE_ERROR_DEG:g} degrees, either way, or"
-            " start from features."
+            f"A turntable's step of {unfit[0]:g} degrees gives no axis",
+            f"step by {MAX_ANGLE_ERROR_DEG:g} to {180 - MAX_ANGLE_ERROR_DEG:g} degrees, either way,"
+            " or start from features.",
         )
     # registration turns the later scan back by the table's step
     turns = np.array([-np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec()) for T in steps])
@@ -252,8 +252,8 @@ def fit_turntable_axis(steps: Sequence[Floats], step_deg: ArrayLike) -> Turntabl
         if abs(angle - deg) > MAX_ANGLE_ERROR_DEG:
             raise InputError(
                 f"Two scans in a row lie {angle:.1f} degrees apart and the turntable is said to"
-                f" step by {deg:g}: check the angle and the order of the scans, or start from"
-                " features."
+                f" step by {deg:g}",
+                "check the angle and the order of the scans, or start from features.",
             )
     direction = (turns / angles[:, None] * np.sign(given)[:, None]).mean(axis=0)
     A = np.vstack([np.eye(3) - T[:3, :3] for T in steps])

@@ -94,8 +94,8 @@ def draw_error_maps(
     """
     if not maps or len({m.shape for m in maps.values()}) != 1:
         raise InputError(
-            f"the error maps of '{title}' differ in size, or there are none: give each model's, one"
-            " size"
+            f"the error maps of '{title}' differ in size, or there are none",
+            "give each model's, one size",
         )
     rows, columns = _crop_slices(list(maps.values()))
     cropped = {model: errors[rows, columns] for model, errors in maps.items()}

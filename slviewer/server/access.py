@@ -134,11 +134,11 @@ class Access:
         given = list(tokens.values())
         if not all(map(_TOKEN.fullmatch, given)):
             raise UsageError(
-                "A token has 16 or more letters, digits, - and _: leave it out and slviewer makes"
-                " one."
+                "A token has 16 or more letters, digits, - and _",
+                "leave it out and slviewer makes one.",
             )
         if len(set(given)) < len(given):
-            raise UsageError("Two roles have the same token: choose different ones.")
+            raise UsageError("Two roles have the same token", "choose different ones.")
         self._wrong: dict[str, list[float]] = {}
         self.renew(tokens)
 

@@ -22,8 +22,8 @@ def listen(host: str, port: int) -> Listener:
     """
     if not host or not 0 <= port <= 65535:
         raise SlviewerError(
-            f"{host or 'An empty host'}:{port} is not an address to serve at: try 127.0.0.1 and"
-            " port 8080."
+            f"{host or 'An empty host'}:{port} is not an address to serve at",
+            "try 127.0.0.1 and port 8080.",
         )
     family, address = _resolve(host, port)
     sock = Listener(family, socket.SOCK_STREAM)
@@ -70,8 +70,8 @@ def _resolve(host: str, port: int) -> tuple[int, tuple]:
     thread.join(RESOLVE_SECONDS)
     if not candidates:
         raise SlviewerError(
-            f"No address was found for the host {host!r}: use 127.0.0.1 for this machine alone, "
-            "or an address of this machine to let others in."
+            f"No address was found for the host {host!r}",
+            "use 127.0.0.1 for this machine alone, or an address of this machine to let others in.",
         )
     return candidates[0]
 

@@ -40,11 +40,11 @@ def load_tokens(path: Path) -> dict[Role, str]:
     try:
         with open_regular(path) as file:
             if os.name == "posix" and os.fstat(file.fileno()).st_mode & 0o077:
-                raise UsageError(f"Others can read the tokens in {path}: run chmod 600 {path}.")
+                raise UsageError(f"Others can read the tokens in {path}", f"run chmod 600 {path}.")
             given = tomllib.loads(file.read(_MOST_BYTES).decode())
     except OSError as error:
         raise UsageError(
-            f"{path} cannot be read ({error}): give a TOML file with the tokens."
+            f"{path} cannot be read ({error})", "give a TOML file with the tokens."
         ) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(
@@ -85,7 +85,7 @@ class TlsCertificate:
 
         def refuse_passphrase() -> str:
             """Raise SlviewerError in place of a question on the terminal."""
-            raise SlviewerError(f"{self.key} is encrypted: give a key without a passphrase.")
+            raise SlviewerError(f"{self.key} is encrypted", "give a key without a passphrase.")
 
         try:
             for path in (self.chain, self.key):
@@ -93,8 +93,8 @@ class TlsCertificate:
             context.load_cert_chain(self.chain, self.key, refuse_passphrase)
         except (OSError, ValueError) as error:
             raise SlviewerError(
-                f"{self.chain} and {self.key} cannot be used for TLS ({error}): give a certificate"
-                " and its key, as PEM."
+                f"{self.chain} and {self.key} cannot be used for TLS ({error})",
+                "give a certificate and its key, as PEM.",
             ) from error
         return context
 
@@ -120,8 +120,9 @@ def self_made_certificate(
         from cryptography import x509
     except ImportError as error:
         raise SlviewerError(
-            "A certificate is made by the package cryptography: install it with pip install"
-            " 'slviewer[tls]', or give a certificate and its key with --tls-files."
+            "A certificate is made by the package cryptography",
+            "install it with pip install 'slviewer[tls]', or give a certificate and its key with"
+            " --tls-files.",
         ) from error
     folder = folder or _config_folder()
     certificate = TlsCertificate(

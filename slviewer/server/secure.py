@@ -59,9 +59,9 @@ class Serving:
         for name in self.names:
             if not _NAME.fullmatch(name):
                 raise UsageError(
-                    f"{name!r} is not a host name as browsers send it: give one of letters, digits,"
-                    " '-' and '.', with its port if that is another one, and other letters as"
-                    " xn--…"
+                    f"{name!r} is not a host name as browsers send it",
+                    "give one of letters, digits, '-' and '.', with its port if that is another"
+                    " one, and other letters as xn--…",
                 )
 
 

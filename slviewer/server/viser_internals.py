@@ -111,7 +111,8 @@ def check_version() -> None:
     if viser.__version__ != VISER:
         raise SlviewerError(
             f"viser {viser.__version__} is installed, but this slviewer serves safely only with"
-            f" viser {VISER}: install it with pip install viser=={VISER}."
+            f" viser {VISER}",
+            f"install it with pip install viser=={VISER}.",
         )
 
 
@@ -131,8 +132,8 @@ def stop(server: viser.ViserServer) -> None:
 def _refuse_tunnel(*_: Any, **__: Any) -> NoReturn:
     """Raise SlviewerError: replaces viser's request of a public share link."""
     raise SlviewerError(
-        "slviewer opens no tunnel to the internet: use --host, or ssh -L, to reach it from"
-        " elsewhere."
+        "slviewer opens no tunnel to the internet",
+        "use --host, or ssh -L, to reach it from elsewhere.",
     )
 
 

@@ -357,8 +357,8 @@ def _disk_full_error(folder: Path, needs_bytes: int) -> SessionError:
         else ""
     )
     return SessionError(
-        f"the disk is full: the save {needs}{format_bytes(free)} are free on {folder}: "
-        "free some space or choose another folder"
+        f"the disk is full: the save {needs}{format_bytes(free)} are free on {folder}",
+        "free some space or choose another folder",
     )
 
 
@@ -382,5 +382,5 @@ def disk_errors(folder: Path, needs_bytes: int = 0) -> Iterator[None]:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise _disk_full_error(folder, needs_bytes) from error
         raise SessionError(
-            f"{folder} cannot be written ({error}): check its permissions and the disk"
+            f"{folder} cannot be written ({error})", "check its permissions and the disk"
         ) from error

@@ -47,7 +47,8 @@ def require_packages(file_format: str) -> None:
     missing = [package for package in PACKAGES[file_format] if find_spec(package) is None]
     if missing:
         raise SessionError(
-            f".{file_format} files need the package {missing[0]}: install it with {INSTALL_COMMAND}"
+            f".{file_format} files need the package {missing[0]}",
+            f"install it with {INSTALL_COMMAND}",
         )
 
 
@@ -64,12 +65,12 @@ def load_triangles(
     status, output = run_isolated(__name__, file_format, data=data, cpu_s=cpu_s)
     if status == 1:
         raise SessionError(
-            f"{name} holds no surfaces that can be read, or is damaged: export the model again"
+            f"{name} holds no surfaces that can be read, or is damaged", "export the model again"
         )
     if status != 0:
         raise SessionError(
-            f"{name} is damaged, or needs more than 2 GB or {cpu_s} s to read: export the model"
-            " again, or as STL"
+            f"{name} is damaged, or needs more than 2 GB or {cpu_s} s to read",
+            "export the model again, or as STL",
         )
     with np.load(io.BytesIO(output)) as arrays:
         vertices, faces, found = arrays["vertices"], arrays["faces"], arrays["notes"].tolist()

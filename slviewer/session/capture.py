@@ -91,8 +91,9 @@ class Capture:
         """Raise InputError, that this cannot be done, for an imported cloud."""
         if self.is_imported_cloud:
             raise InputError(
-                f"Cannot {verb} {self.name!r}: it was imported as a cloud ({self.meta['source']})"
-                " and has no frames. Align, merge, measure or compare it as it is."
+                f"Cannot {verb} {self.name!r}",
+                f"it was imported as a cloud ({self.meta['source']}) and has no frames. Align,"
+                " merge, measure or compare it as it is.",
             )
 
     @property
@@ -131,7 +132,8 @@ class Capture:
             raise DamagedError(
                 f"{self.name}: {self.folder} is damaged: its description states {n} frames of"
                 f" {width}x{height} px, and frames.zarr holds {shape[0]} of {shape[2]}x{shape[1]}"
-                " px: restore the folder from a copy, or import or record the capture again"
+                " px",
+                "restore the folder from a copy, or import or record the capture again",
             )
         if (indices is None or self.exposures_ms) and not stored.has_checksums:
             _verify_once(self.folder, self.hash, stored.identify())
@@ -148,7 +150,8 @@ class Capture:
         if second.hash != self.meta[SECOND]:
             raise DamagedError(
                 f"{self.name}: the frames of its second camera are not those that were saved with"
-                " it: restore the folder from a copy, or import or record the capture again"
+                " it",
+                "restore the folder from a copy, or import or record the capture again",
             )
         return replace(second, name=f"{self.name}, second camera")
 
@@ -178,8 +181,8 @@ class Capture:
         seen = self.meta.get(SECOND, "")
         if _hash_content(content, described, exposures_ms, self.texture, seen) != self.hash:
             raise DamagedError(
-                f"{self.name}: what {self.folder} holds is not what was saved (its hash differs):"
-                " restore the folder from a copy, or import or record the capture again"
+                f"{self.name}: what {self.folder} holds is not what was saved (its hash differs)",
+                "restore the folder from a copy, or import or record the capture again",
             )
         if self.second is not None:
             self.second.verify()
@@ -243,8 +246,8 @@ class Capture:
                 raise InputError(f"its shape is {image.shape}, not {shape}")
         except InputError as error:
             raise DamagedError(
-                f"{self.name}: its texture is damaged ({path}: {error}): restore this file from a"
-                " copy, or import or record the capture again"
+                f"{self.name}: its texture is damaged ({path}: {error})",
+                "restore this file from a copy, or import or record the capture again",
             ) from error
         return np.ascontiguousarray(image[..., ::-1])
 
@@ -327,8 +330,8 @@ class NewCapture:
             self.second.check()
             if self.second.sequence != self.sequence:
                 raise InputError(
-                    f"{self.name}: its two cameras saw different patterns: give both the same"
-                    " sequence"
+                    f"{self.name}: its two cameras saw different patterns",
+                    "give both the same sequence",
                 )
         check_stack_array(self.frames)
         if (
@@ -337,13 +340,13 @@ class NewCapture:
             or min(exposures, default=1) <= 0
         ):
             raise InputError(
-                f"exposures of {list(exposures)} ms: give two or more, each once, or none"
+                f"exposures of {list(exposures)} ms", "give two or more, each once, or none"
             )
         if len(self.frames) != len(self.sequence.frames) * max(1, len(exposures)):
             times = f" in {len(exposures)} exposures" if exposures else ""
             raise InputError(
-                f"{shape[0]} frames for a sequence of {len(self.sequence.frames)}{times}: give one"
-                " image a pattern"
+                f"{shape[0]} frames for a sequence of {len(self.sequence.frames)}{times}",
+                "give one image a pattern",
             )
         if texture is not None and (
             texture.shape != (*shape[1:], 3) or texture.dtype not in (np.uint8, np.uint16)
@@ -375,7 +378,7 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
         )
         if not done:
             raise InputError(
-                "the texture could not be encoded as PNG: give a colour image of 8 or 16 bits"
+                "the texture could not be encoded as PNG", "give a colour image of 8 or 16 bits"
             )
         write_bytes(folder / "texture.png", data.data)
     write_bytes(
@@ -490,5 +493,5 @@ def _require_unchanged(folder: Path, content_hash: str) -> None:
     """Raise SessionError where the capture in a folder has another hash than when it was loaded."""
     if read_json(folder / "capture.json").get("hash") != content_hash:
         raise SessionError(
-            f"capture {folder.name!r} was replaced while it was in use: load it again"
+            f"capture {folder.name!r} was replaced while it was in use", "load it again"
         )

@@ -42,7 +42,7 @@ def write_calibration(
         data = storage.releaseAndGetString().encode()
     else:
         raise InputError(
-            f"{path.name}: a calibration is written as .yml, .xml or .json: choose one of these"
+            f"{path.name}: a calibration is written as .yml, .xml or .json", "choose one of these"
         )
     replace_file(path, data)
 
@@ -55,7 +55,7 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
     """
     folder = expand_user(folder).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder} is not empty: choose a new folder for the patterns")
+        raise InputError(f"{folder} is not empty", "choose a new folder for the patterns")
     names = []
     for index, frame in enumerate(sequence.frames):
         parts: list[Any] = [frame.kind, frame.axis]
@@ -69,7 +69,7 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
             done, data = cv2.imencode(".png", render_pattern(sequence, index))
             if not done:
                 raise InputError(
-                    f"pattern {name} could not be encoded as PNG: is the projector's size right?"
+                    f"pattern {name} could not be encoded as PNG", "is the projector's size right?"
                 )
             write_bytes(staged / name, data.data)
         write_bytes(staged / "sequence.toml", describe_sequence(sequence, names).encode())
@@ -94,8 +94,8 @@ def _write_entry(storage: Any, key: str, value: Any) -> None:
         matrix = np.asarray(value)
         if matrix.ndim not in (1, 2) or matrix.dtype.kind not in "iuf":
             raise InputError(
-                f"{key} is not a number, word or matrix: an OpenCV file cannot hold it, write .json"
-                " instead"
+                f"{key} is not a number, word or matrix",
+                "an OpenCV file cannot hold it, write .json instead",
             )
         # a vector as a column: OpenCV's own files hold T so, and D is read either way
         column = matrix if matrix.ndim == 2 else matrix[:, None]

@@ -56,8 +56,8 @@ class PlanFeature:
         lacks_direction = self.direction is None and self.kind != "sphere"
         if self.kind == "surface" or self.place is None or lacks_direction:
             raise InputError(
-                f"The nominal of {self.name} is not known: give place, direction and radius of the"
-                " feature in the plan."
+                f"The nominal of {self.name} is not known",
+                "give place, direction and radius of the feature in the plan.",
             )
         direction = None if self.direction is None else unit_vectors(np.array(self.direction))
         return Feature(self.kind, np.array(self.place), direction, self.radius)
@@ -141,12 +141,14 @@ def read_plan(path: Path | str) -> Plan:
     unknown = [key for key in data if key not in Plan.__dataclass_fields__]
     if unknown:
         raise InputError(
-            f"{path}: a plan has no {', '.join(unknown)}: remove it, or correct its name"
+            f"{path}: a plan has no {', '.join(unknown)}", "remove it, or correct its name"
         )
     try:
         plan = from_plain(data, Plan)
     except InputError as error:
-        raise InputError(f"{path} is not an inspection plan ({error}): correct it there") from error
+        raise InputError(
+            f"{path} is not an inspection plan ({error})", "correct it there"
+        ) from error
     if plan.alignment.nominal is None:
         return plan
     nominal = Path(path).expanduser().absolute().parent / plan.alignment.nominal

@@ -37,18 +37,19 @@ def session_folder(path: str | Path) -> Path:
     folder = expand_user(path).absolute()
     if not is_session(folder):
         raise SessionError(
-            f"{folder} is not a session folder (it holds no session.json): give the folder of a"
-            " session, or make one with `slviewer import` or `slviewer simulate`"
+            f"{folder} is not a session folder (it holds no session.json)",
+            "give the folder of a session, or make one with `slviewer import` or `slviewer"
+            " simulate`",
         )
     schema = read_json(folder / "session.json").get("schema")
     if not isinstance(schema, int) or schema < 1:
         raise SessionError(
-            f"{folder / 'session.json'} names no schema: restore the file from a copy"
+            f"{folder / 'session.json'} names no schema", "restore the file from a copy"
         )
     if schema > SCHEMA:
         raise SessionError(
-            f"{folder} was made by a newer slviewer (schema {schema}; this one reads {SCHEMA}):"
-            " update slviewer"
+            f"{folder} was made by a newer slviewer (schema {schema}; this one reads {SCHEMA})",
+            "update slviewer",
         )
     return folder
 
@@ -60,22 +61,23 @@ def new_folder(path: str | Path) -> tuple[Path, bool]:
     if _IS_WINDOWS and len(str(folder)) > _LONGEST_FOLDER:
         raise SessionError(
             f"the path of the session has {len(str(folder))} characters, and Windows allows 259 for"
-            f" each file in it: choose a place with at most {_LONGEST_FOLDER}"
+            " each file in it",
+            f"choose a place with at most {_LONGEST_FOLDER}",
         )
     if is_session(folder):
-        raise SessionError(f"{folder} is a session already: open it, or choose another folder")
+        raise SessionError(f"{folder} is a session already", "open it, or choose another folder")
     try:
         existed = folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         unknown = [entry.name for entry in folder.iterdir() if not _is_leftover(entry)]
     except OSError as error:
         raise SessionError(
-            f"{folder} cannot be made ({error}): choose a folder that you may write to"
+            f"{folder} cannot be made ({error})", "choose a folder that you may write to"
         ) from error
     if unknown:
         raise SessionError(
-            f"{folder} holds other things ({unknown[0]}): choose a new or an empty folder for the"
-            " session"
+            f"{folder} holds other things ({unknown[0]})",
+            "choose a new or an empty folder for the session",
         )
     return folder, not existed
 
@@ -194,12 +196,12 @@ class WriterLock:
             self._lock.acquire(timeout=patience_s, poll_interval=0.02)
         except Timeout as error:
             raise SessionError(
-                f"{self._folder} is open for writing in {self._who()}: close it there, or wait"
-                " until it has finished"
+                f"{self._folder} is open for writing in {self._who()}",
+                "close it there, or wait until it has finished",
             ) from error
         except OSError as error:
             raise SessionError(
-                f"{self._folder} cannot be written ({error}): check its permissions"
+                f"{self._folder} cannot be written ({error})", "check its permissions"
             ) from error
         with contextlib.suppress(OSError):  # it is only for the message to others
             self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))

@@ -19,7 +19,8 @@ def safe_name(name: str) -> str:
     """
     if not is_safe_name(name):
         raise InputError(
-            f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', with no path in it"
+            f"{name!r} cannot be a name",
+            "use letters, digits, '_', '-' and '.', with no path in it",
         )
     return name
 
@@ -35,13 +36,14 @@ def new_name(name: str, others: Iterable[str] = ()) -> str:
     InputError otherwise. What has such a name already can be read."""
     if _DEVICE.fullmatch(safe_name(name)):
         raise InputError(
-            f"{name!r} cannot be a name: Windows keeps it for a device: choose another one"
+            f"{name!r} cannot be a name: Windows keeps it for a device", "choose another one"
         )
     for other in others:
         if other != name and other.lower() == name.lower():
             raise InputError(
                 f"{name!r} cannot be a name beside {other!r}: Windows and macOS do not tell them"
-                " apart: choose another"
+                " apart",
+                "choose another",
             )
     return name
 
@@ -51,7 +53,8 @@ def safe_path(name: str) -> str:
     else InputError."""
     if not isinstance(name, str) or not name:
         raise InputError(
-            f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', parts joined by '/'"
+            f"{name!r} cannot be a name",
+            "use letters, digits, '_', '-' and '.', parts joined by '/'",
         )
     for part in name.split("/"):
         safe_name(part)
@@ -70,7 +73,9 @@ def clean_label(text: str) -> str:
     characters that are not printable: controls, and marks that change the direction of writing."""
     label = " ".join(text.split())
     if not label.isprintable():
-        raise InputError(f"{label!r} holds characters that cannot be printed: type the name again")
+        raise InputError(
+            f"{label!r} holds characters that cannot be printed", "type the name again"
+        )
     return label
 
 

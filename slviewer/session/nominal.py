@@ -69,8 +69,8 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     path = expand_user(path)
     if path.suffix.lower() not in FORMATS:
         raise SessionError(
-            f"{path.name} is not a nominal model that can be read: give an STL, PLY, OBJ, STEP or"
-            " 3MF file"
+            f"{path.name} is not a nominal model that can be read",
+            "give an STL, PLY, OBJ, STEP or 3MF file",
         )
     remedy = f"give a file of up to {MAX_BYTES >> 20} MiB"
     data = read_input(path, MAX_BYTES, remedy, SessionError)
@@ -113,12 +113,12 @@ def check_size(nominal: Nominal, points: np.ndarray) -> None:
     )
     if fitting:
         raise InputError(
-            f"{comparison}: give --units {' or --units '.join(fitting)} if it is so, else"
-            " --units mm"
+            f"{comparison}",
+            f"give --units {' or --units '.join(fitting)} if it is so, else --units mm",
         )
     raise InputError(
-        f"{comparison}: see that it is the same part; give --units mm if its numbers are mm all the"
-        " same"
+        f"{comparison}",
+        "see that it is the same part; give --units mm if its numbers are mm all the same",
     )
 
 
@@ -134,18 +134,23 @@ def _merge_vertices(name: str, polygons: Polygons, scale: float) -> Polygons:
 
     vertices, corners, counts = polygons.vertices, polygons.corners, polygons.counts
     if not (counts > 2).any():
-        raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
+        raise SessionError(
+            f"{name} holds no triangles, or is damaged", "export the model as a mesh"
+        )
     if corners.min() < 0 or corners.max() >= len(vertices):
-        raise SessionError(f"{name} has triangles whose points are missing: export the model again")
+        raise SessionError(
+            f"{name} has triangles whose points are missing", "export the model again"
+        )
     if not np.isfinite(vertices).all():
         raise SessionError(
-            f"{name} holds points that are not numbers (NaN or infinite): export the model again"
+            f"{name} holds points that are not numbers (NaN or infinite)", "export the model again"
         )
     vertices = scale * vertices
     if not (reach := np.abs(vertices).max()) < MAX_COORDINATE_MM:
         raise SessionError(
-            f"{name} reaches {reach:.3g} mm: models up to {MAX_COORDINATE_MM:g} mm are read; give"
-            " its units, or move it to its origin"
+            f"{name} reaches {reach:.3g} mm",
+            f"models up to {MAX_COORDINATE_MM:g} mm are read; give its units, or move it to its"
+            " origin",
         )
     first, same = unique_rows(vertices, digits=MERGED_DECIMALS)
     return Polygons(vertices[first], same[corners], counts)
@@ -160,8 +165,8 @@ def _repair(
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if (flat := np.count_nonzero(~sound)) > MAX_DEGENERATE_SHARE * len(faces):
         raise SessionError(
-            f"{flat:,} of the {len(faces):,} triangles in {name} have no area: export the model"
-            " again"
+            f"{flat:,} of the {len(faces):,} triangles in {name} have no area",
+            "export the model again",
         )
     for kept in (distinct, sound) if (distinct & ~sound).any() else (sound,):
         repairs: list[str] = []

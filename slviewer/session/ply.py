@@ -119,8 +119,8 @@ def read_ply(path: str | Path) -> Ply:
     data = read_input(path, MAX_CLOUD_BYTES, "check its name.")
     if not data.startswith(b"ply\nformat binary_little_endian 1.0\n"):
         raise InputError(
-            f"{path} is not a binary little-endian PLY: only files that slviewer wrote can be read"
-            " back."
+            f"{path} is not a binary little-endian PLY",
+            "only files that slviewer wrote can be read back.",
         )
     with decoding(path, InputError):
         _, elements, position = parse_ply_header(data)
@@ -130,8 +130,8 @@ def read_ply(path: str | Path) -> Ply:
     vertices = {name: values for name, (values, _) in rows.get("vertex", {}).items()}
     if position != len(data) or not set(PLACE) <= vertices.keys():
         raise InputError(
-            f"{path} holds {len(data)} bytes and the properties {', '.join(vertices) or 'none'}: it"
-            " is damaged, or has no points."
+            f"{path} holds {len(data)} bytes and the properties {', '.join(vertices) or 'none'}",
+            "it is damaged, or has no points.",
         )
     points, normals, colours = (
         np.stack([vertices.pop(name) for name in names], axis=1)
@@ -149,7 +149,7 @@ def read_ply(path: str | Path) -> Ply:
         return Ply(points, colours, normals, vertices)
     corners, counts = rows["face"].get("vertex_indices", (NO_INDICES, np.ones(1)))
     if (counts != 3).any():
-        raise InputError(f"{path} has faces that are not triangles: triangulate it first.")
+        raise InputError(f"{path} has faces that are not triangles", "triangulate it first.")
     return Ply(points, colours, normals, vertices, corners.reshape(-1, 3))
 
 
@@ -240,8 +240,8 @@ def check_faces(faces: np.ndarray, count: int) -> None:
         or (faces.size and not 0 <= faces.min() <= faces.max() < count)
     ):
         raise InputError(
-            f"Faces of shape {faces.shape} were given: (m, 3) indices below {count}, the number of"
-            " points."
+            f"Faces of shape {faces.shape} were given",
+            f"(m, 3) indices below {count}, the number of points.",
         )
 
 
@@ -255,11 +255,11 @@ def _vertex_fields(
     lays them out."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
-            f"Points of shape {points.shape} were given: a PLY holds (n, 3); select the valid ones"
-            " first."
+            f"Points of shape {points.shape} were given",
+            "a PLY holds (n, 3); select the valid ones first.",
         )
     if not np.isfinite(points).all():
-        raise InputError("Some points are NaN: select the valid ones first.")
+        raise InputError("Some points are NaN", "select the valid ones first.")
     shape, count = points.shape, len(points)
     given: list[tuple[str, tuple[str, ...], str, np.ndarray | None]] = [
         ("normals", NORMAL, "<f4", normals),
@@ -273,11 +273,11 @@ def _vertex_fields(
         shapes = [shape] if names == NORMAL else [shape, (count,)] if code == "u1" else [(count,)]
         if values.shape not in shapes:
             raise InputError(
-                f"{what} of shape {values.shape} do not belong to {count} points: give one for each"
-                " point."
+                f"{what} of shape {values.shape} do not belong to {count} points",
+                "give one for each point.",
             )
         if code == "u1" and values.dtype != np.uint8:
-            raise InputError(f"Colours of {values.dtype} were given: they must be uint8.")
+            raise InputError(f"Colours of {values.dtype} were given", "they must be uint8.")
         if len(names) == 1:
             _check_scalar(what, values, [name for before, _, _ in fields for name in before])
         elif values.ndim == 1:
@@ -291,9 +291,9 @@ def _check_scalar(name: str, values: np.ndarray, others: Sequence[str]) -> None:
     values other than a sigma's."""
     if not (name.isascii() and name.isidentifier()) or name in others:
         raise InputError(
-            f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a new"
-            " name."
+            f"A scalar named {name!r} cannot be a PLY property",
+            "use letters, digits, _, and a new name.",
         )
     unknown = np.count_nonzero(~np.isfinite(values))
     if unknown and not name.startswith("sigma"):
-        raise InputError(f"{name} is not known of {unknown} points: leave them out.")
+        raise InputError(f"{name} is not known of {unknown} points", "leave them out.")

@@ -40,10 +40,10 @@ def read_polygons(name: str, data: bytes, notes: list[str]) -> Polygons:
     try:
         return _READERS[name.rpartition(".")[2].lower()](name, data, notes)
     except MemoryError as error:
-        raise SessionError(f"{name} does not fit into the memory: decimate it first") from error
+        raise SessionError(f"{name} does not fit into the memory", "decimate it first") from error
     except (ValueError, LookupError, OverflowError, TypeError) as error:
         raise SessionError(
-            f"{name} cannot be read ({error}): it is damaged; export the model again"
+            f"{name} cannot be read ({error})", "it is damaged; export the model again"
         ) from error
 
 
@@ -84,8 +84,8 @@ def triangulate_polygons(polygons: Polygons, notes: list[str]) -> np.ndarray:
             crossing += [] if is_simple else [k]
             if sum(crossing) > MAX_CORNERS:
                 raise SessionError(
-                    f"{len(crossing):,} polygons or more cross themselves, one of {k:,} corners:"
-                    " export the model again, as triangles"
+                    f"{len(crossing):,} polygons or more cross themselves, one of {k:,} corners",
+                    "export the model again, as triangles",
                 )
     if len(uneven := (height := np.concatenate(heights))[height > CHORD_MM]):
         notes.append(
@@ -119,7 +119,8 @@ def _clip_ears(points: np.ndarray) -> tuple[np.ndarray, bool]:
 def too_many(name: str, amount: str) -> SessionError:
     """Return the error for a model that is too large."""
     return SessionError(
-        f"{name} has {amount}, and at most {MAX_TRIANGLES:,} triangles are read: decimate it first"
+        f"{name} has {amount}, and at most {MAX_TRIANGLES:,} triangles are read",
+        "decimate it first",
     )
 
 
@@ -173,8 +174,8 @@ def _read_stl(name: str, data: bytes, notes: list[str]) -> Polygons:
     rest = len(data) - end
     if rest >= _FACET.itemsize and data[end:].strip(b"\0\t\n\r\x1a "):
         raise SessionError(
-            f"{name} announces {count:,} triangles and holds"
-            f" {count + rest // _FACET.itemsize:,}: export the model again"
+            f"{name} announces {count:,} triangles and holds {count + rest // _FACET.itemsize:,}",
+            "export the model again",
         )
     if rest:
         notes.append(f"{rest:,} bytes after the last of its {count:,} triangles were skipped")
@@ -198,8 +199,8 @@ def _read_text_stl(name: str, data: bytes, notes: list[str]) -> Polygons:
     rows = re.findall(rb"\bvertex\s+(\S+\s+\S+\s+\S+)", text)
     if len(rows) != 3 * ended:
         raise SessionError(
-            f"{name} has {len(rows):,} corners in {ended:,} facets, which are triangles in an STL:"
-            " export the model again"
+            f"{name} has {len(rows):,} corners in {ended:,} facets, which are triangles in an STL",
+            "export the model again",
         )
     numbers = _with_points(b" ".join(rows), notes)
     vertices = np.array(numbers.split(), np.float64).reshape(-1, 3)
@@ -243,6 +244,6 @@ def _check_counts(name: str, counts: np.ndarray) -> None:
         raise too_many(name, f"{triangles:,} triangles or more")
     if len(counts) and counts.max() > MAX_CORNERS:
         raise SessionError(
-            f"{name} has a polygon of {counts.max():,} corners, more than {MAX_CORNERS:,}: export"
-            " the model again, as triangles"
+            f"{name} has a polygon of {counts.max():,} corners, more than {MAX_CORNERS:,}",
+            "export the model again, as triangles",
         )

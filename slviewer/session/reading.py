@@ -93,9 +93,9 @@ def read_json(
     try:
         data = _check_values(json.loads(read_file(path, MAX_JSON_BYTES)))
     except (ValueError, OSError, RecursionError, MemoryError) as error:
-        raise DamagedError(f"{path} cannot be read ({_reason(error)}): {remedy}") from error
+        raise DamagedError(f"{path} cannot be read ({_reason(error)})", remedy) from error
     if not isinstance(data, dict):
-        raise DamagedError(f"{path} holds no JSON object: {remedy}")
+        raise DamagedError(f"{path} holds no JSON object", remedy)
     return data
 
 
@@ -119,7 +119,7 @@ def read_toml(path: Path | str) -> dict[str, Any]:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         data: dict[str, Any] = _check_values(tomllib.loads(text))
     except (ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"{path} is not TOML ({_reason(error)}): correct it there") from error
+        raise InputError(f"{path} is not TOML ({_reason(error)})", "correct it there") from error
     return data
 
 
@@ -129,7 +129,7 @@ def expand_user(path: Path | str) -> Path:
         return Path(path).expanduser()
     except RuntimeError as error:
         raise InputError(
-            f"{path} names a user that does not exist here: give the whole path"
+            f"{path} names a user that does not exist here", "give the whole path"
         ) from error
 
 

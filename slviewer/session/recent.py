@@ -94,7 +94,7 @@ class RecentSessions:
         if folder is None or place is None:
             raise InputError("no deleted session can be restored")
         if folder.exists():
-            raise SessionError(f"{folder} exists again: move it away, then restore the session")
+            raise SessionError(f"{folder} exists again", "move it away, then restore the session")
         atomic.move(place, folder)
         self.add(folder)
         return folder

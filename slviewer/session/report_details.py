@@ -64,6 +64,6 @@ def encode_logo(name: str, content: bytes) -> str:
             image.convert("RGBA").save(buffer, "WEBP", quality=90)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(
-            f"{name} cannot be read as a logo ({error}): give a PNG, JPEG or WebP image"
+            f"{name} cannot be read as a logo ({error})", "give a PNG, JPEG or WebP image"
         ) from error
     return base64.b64encode(buffer.getvalue()).decode()

@@ -50,7 +50,7 @@ class Meta(dict[str, Any]):
 
     def __missing__(self, key: str) -> Any:
         raise DamagedError(
-            f"{self._place} lacks the entry {key!r}: restore it from a copy, or compute it again"
+            f"{self._place} lacks the entry {key!r}", "restore it from a copy, or compute it again"
         )
 
 
@@ -217,8 +217,8 @@ def check_place(root: Path, name: str) -> None:
     for other in list_results(root):
         if name.startswith(f"{other}/") or other.startswith(f"{name}/"):
             raise InputError(
-                f"result {name!r} and result {other!r} would lie inside each other: choose another"
-                " name"
+                f"result {name!r} and result {other!r} would lie inside each other",
+                "choose another name",
             )
 
 
@@ -229,13 +229,13 @@ def check_result(
     are not arrays."""
     if reserved := _RESERVED & set(meta):
         raise InputError(
-            f"meta holds {sorted(reserved)}, which the session writes itself: use other keys"
+            f"meta holds {sorted(reserved)}, which the session writes itself", "use other keys"
         )
     checked = {safe_path(name): np.asarray(array) for name, array in arrays.items()}
     for name, array in checked.items():
         if array.dtype.hasobject:
             raise InputError(
-                f"array {name!r} holds Python objects: give numbers, or put it into meta"
+                f"array {name!r} holds Python objects", "give numbers, or put it into meta"
             )
     return checked
 
@@ -367,5 +367,6 @@ def _combine_digests(meta: Mapping[str, Any], digests: Mapping[str, bytes]) -> s
 def _damage(folder: Path, fault: str) -> DamagedError:
     """Return the error for a damaged result, with its folder and the remedy."""
     return DamagedError(
-        f"the result in {folder} is damaged ({fault}): compute it again, or restore it from a copy"
+        f"the result in {folder} is damaged ({fault})",
+        "compute it again, or restore it from a copy",
     )

@@ -48,8 +48,9 @@ def load_edits(store: Session, scan: str) -> EditHistory:
         return EditHistory(tuple(edits), meta["applied"])
     except InputError as error:
         raise DamagedError(
-            f"the edits of {scan} are damaged ({error}): restore {store.folder / 'results' / name}"
-            " from a copy, or delete it, which forgets them"
+            f"the edits of {scan} are damaged ({error})",
+            f"restore {store.folder / 'results' / name} from a copy, or delete it, which forgets"
+            " them",
         ) from error
 
 

@@ -109,7 +109,7 @@ def write_shape(
     if not len(points) or (faces is not None and not len(faces)):
         raise InputError(f"{path.name} would be empty: there is nothing to write")
     if not np.isfinite(points).all():
-        raise InputError(f"{path.name}: some points are NaN: select the valid ones first")
+        raise InputError(f"{path.name}: some points are NaN", "select the valid ones first")
     values = dict(scalars or {})
     if shape.sigma_mm is not None:
         values.setdefault("sigma", shape.sigma_mm)
@@ -129,7 +129,9 @@ def _find_format(path: Path, is_mesh: bool) -> ShapeFormat:
         what = "a mesh" if is_mesh else "a cloud"
         why = ": it has no triangles" if name in mesh_formats() else ""
         listed = ", ".join(f".{each}" for each in possible)
-        raise InputError(f"{path.name}: {what} cannot be written so{why}; choose one of {listed}")
+        raise InputError(
+            f"{path.name}", f"{what} cannot be written so{why}; choose one of {listed}"
+        )
     return all_formats()[name]
 
 
@@ -156,7 +158,7 @@ def write_textured(
         return path.stat().st_size
     if file_format != ".obj":
         raise InputError(
-            f"{path.name}: a texture is kept by .glb and .obj: end its name in one of these"
+            f"{path.name}: a texture is kept by .glb and .obj", "end its name in one of these"
         )
     return write_textured_obj(path, shape, uv, picture, notes)
 

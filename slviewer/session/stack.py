@@ -111,8 +111,8 @@ class FrameStack:
             or codecs not in (["bytes"], ["bytes", "crc32c"])
         ):
             raise SessionError(
-                f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it"
-                " again"
+                f"{path} was not laid out by slviewer (one uncompressed chunk a frame)",
+                "import it again",
             )
         dtype = np.dtype(described.data_type)
         return cls(path, described.shape, dtype, separator, "crc32c" in codecs)
@@ -180,7 +180,7 @@ class FrameStack:
         permission."""
         if isinstance(error, PermissionError):
             return SessionError(
-                f"{self.chunk_path(index)} cannot be read ({error}): check its permissions"
+                f"{self.chunk_path(index)} cannot be read ({error})", "check its permissions"
             )
         missing = isinstance(error, FileNotFoundError | NotADirectoryError)
         return self._damage(
@@ -191,8 +191,8 @@ class FrameStack:
         """Return the error for a damaged frame, with the capture's name and the remedy."""
         return DamagedError(
             f"{self.path.parent.name}: frame {index + 1} of {self.shape[0]} is damaged"
-            f" ({self.chunk_path(index)} {fault}): "
-            "restore this file from a copy, or import or record the capture again"
+            f" ({self.chunk_path(index)} {fault})",
+            "restore this file from a copy, or import or record the capture again",
         )
 
 
@@ -201,7 +201,9 @@ def check_indices(name: str, indices: Iterable[int] | None, count: int) -> list[
     one outside of its ``count``."""
     wanted = list(range(count) if indices is None else map(int, indices))
     if any(not 0 <= index < count for index in wanted):
-        raise InputError(f"frames {wanted} were requested, {name} has {count} frames: count from 0")
+        raise InputError(
+            f"frames {wanted} were requested, {name} has {count} frames", "count from 0"
+        )
     return wanted
 
 

@@ -254,18 +254,18 @@ class Session(Decisions):
             for new in captures:
                 if new.name in staged:
                     raise InputError(
-                        f"two captures are named {new.name!r}: rename one of their folders"
+                        f"two captures are named {new.name!r}", "rename one of their folders"
                     )
                 new_name(new.name, (*taken, *staged))
                 target = self._capture_folder(new.name)
                 replaces = force if isinstance(force, bool) else new.name in force
                 if target.exists() and not replaces:
                     raise InputError(
-                        f"there is a capture {new.name!r} already: choose another name, or replace"
-                        " it with --force"
+                        f"there is a capture {new.name!r} already",
+                        "choose another name, or replace it with --force",
                     )
                 if role not in get_args(Role):
-                    raise InputError(f"role {role!r} is unknown: use 'calibration' or 'scan'")
+                    raise InputError(f"role {role!r} is unknown", "use 'calibration' or 'scan'")
                 new.check()
                 with atomic.staged_folder(target, new.nbytes) as written:
                     write_capture(written, new, role, None if board is None else str(board))
@@ -338,7 +338,7 @@ class Session(Decisions):
                 f"there is no deleted {'result' if '/' in name else 'capture'} {name!r}"
             )
         if self._place_of(name).exists():
-            raise InputError(f"there is a {name!r} again: delete that one first")
+            raise InputError(f"there is a {name!r} again", "delete that one first")
         self.exchange({name: found.place})
 
     # results
@@ -561,7 +561,7 @@ class Session(Decisions):
     def _require_writer(self) -> None:
         """Raise SessionError unless the session is open for writing and the write is allowed."""
         if not self.is_writable:
-            raise SessionError(f"{self.folder} is open for reading only: open it with write=True")
+            raise SessionError(f"{self.folder} is open for reading only", "open it with write=True")
         if self._allow is not None:
             self._allow()
 

@@ -55,7 +55,8 @@ def format_value(value: Any) -> str:
     if isinstance(value, Mapping):
         return f"{{{', '.join(table_lines(value))}}}"
     raise InputError(
-        f"{value!r} cannot stand in a TOML file: use text, numbers, true or false, or lists of them"
+        f"{value!r} cannot stand in a TOML file",
+        "use text, numbers, true or false, or lists of them",
     )
 
 

@@ -17,4 +17,4 @@ def asset(name: str) -> Path:
     for folder in (_PACKAGE / "assets", _PACKAGE.parent / "assets"):
         if (folder / name).exists():
             return folder / name
-    raise InputError(f"the shipped assets/{name} is missing: install slviewer again")
+    raise InputError(f"the shipped assets/{name} is missing", "install slviewer again")

@@ -196,7 +196,7 @@ def printed_board(board: Board, pose: Pose, shape: BoardShape = FLAT, seed: int 
     """
     if board.kind == "charuco":
         raise InputError(
-            "the simulation does not print ChArUco boards: use circles, acircles or a chessboard"
+            "the simulation does not print ChArUco boards", "use circles, acircles or a chessboard"
         )
     margin = 1.5 * board.pitch_mm
     low, high = board.points[:, :2].min(0) - margin, board.points[:, :2].max(0) + margin

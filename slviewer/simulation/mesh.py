@@ -97,6 +97,7 @@ def demo_object(pose: Pose) -> MeshScene:
     mesh = open3d().io.read_triangle_mesh(str(asset("objects/ammonite.ply")))
     if not mesh.has_triangles():
         raise InputError(
-            "the shipped file assets/objects/ammonite.ply has no triangles: install slviewer again"
+            "the shipped file assets/objects/ammonite.ply has no triangles",
+            "install slviewer again",
         )
     return MeshScene(np.asarray(mesh.vertices), np.asarray(mesh.triangles), pose)

@@ -143,8 +143,9 @@ def _place_board(
     features = (board.points[rim] - middle) @ R.T
     if not _is_in_view(rig, board, features + place):
         raise InputError(
-            f"the board {board} does not fit into the view at {depth:.0f} mm: take a smaller one, "
-            f"{np.ptp(board.points[:, 0]):.0f} x {np.ptp(board.points[:, 1]):.0f} mm is too much"
+            f"the board {board} does not fit into the view at {depth:.0f} mm",
+            f"take a smaller one, {np.ptp(board.points[:, 0]):.0f} x"
+            f" {np.ptp(board.points[:, 1]):.0f} mm is too much",
         )
     for direction in (0, 1):  # first along x, then as far along y as is left
         reach, step = 0.0, 3.0

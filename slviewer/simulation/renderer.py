@@ -89,8 +89,8 @@ class Renderer:
         if tuple(sequence.projector) != rig.projector.size:
             raise InputError(
                 f"the patterns are {sequence.projector[0]}x{sequence.projector[1]} px and the"
-                f" simulated projector has {rig.projector.size[0]}x{rig.projector.size[1]}: make"
-                " them for this projector"
+                f" simulated projector has {rig.projector.size[0]}x{rig.projector.size[1]}",
+                "make them for this projector",
             )
         rng = np.random.default_rng([rig.seed, seed, 0xF0])
         keys = rng.integers(0, 2**32, (len(sequence.frames), 2), dtype=np.uint32)
@@ -206,8 +206,8 @@ class Renderer:
         illuminated = light[maps.truth.mask]
         if not illuminated.size:
             raise InputError(
-                "nothing in the scene is illuminated by the projector: move it to where both fields"
-                " meet"
+                "nothing in the scene is illuminated by the projector",
+                "move it to where both fields meet",
             )
         return (sensor.peak_level - sensor.dark_level) / float(
             np.quantile(illuminated, _EXPOSURE_QUANTILE)

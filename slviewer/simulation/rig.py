@@ -75,7 +75,9 @@ class SimulatedRig:
 def check_scale(scale: float) -> None:
     """Raise InputError for a resolution that `letter` does not simulate."""
     if not 0.05 <= scale <= 4:
-        raise InputError(f"the scale {scale:g} is not between 0.05 and 4: 1 is the full 1600x1200")
+        raise InputError(
+            f"the scale {scale:g} is not between 0.05 and 4", "1 is the full 1600x1200"
+        )
 
 
 def letter(

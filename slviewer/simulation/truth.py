@@ -41,7 +41,7 @@ def scene_record(scene: Scene) -> dict[str, Any]:
     if isinstance(scene, MeshScene):
         return {"shape": "mesh", "T_camera_object": scene.pose.matrix.tolist()}
     raise InputError(
-        f"a scene of type {type(scene).__name__} has no record: use a board, spheres or a mesh"
+        f"a scene of type {type(scene).__name__} has no record", "use a board, spheres or a mesh"
     )
 
 

@@ -98,10 +98,10 @@ def fuse(
     points are not those of one camera.
     """
     if not 1 <= len(scans) <= 255:
-        raise InputError(f"{len(scans)} scans were given: fusing takes 1 to 255.")
+        raise InputError(f"{len(scans)} scans were given", "fusing takes 1 to 255.")
     for name in scans:
         if name not in T_reference_scan:
-            raise InputError(f"{name} has no pose: register it first, or exclude it.")
+            raise InputError(f"{name} has no pose", "register it first, or exclude it.")
     report, views = progress or (lambda share: None), {}
     if any(cloud.normals is not None for cloud in scans.values()):
         return _fuse_unorganised(scans, T_reference_scan, poses)

@@ -57,7 +57,7 @@ def poisson_surface(points: PointSet, cell_mm: float) -> Mesh:
     assert points.normals is not None
     if len(points) < LEAST_POINTS:
         raise InputError(
-            f"{len(points)} points make no surface: at least {LEAST_POINTS} are needed."
+            f"{len(points)} points make no surface", f"at least {LEAST_POINTS} are needed."
         )
     known = finite_rows(points.normals)
     middle = points.points.mean(axis=0, dtype=np.float64)
@@ -150,7 +150,8 @@ def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
     if np.prod(shape) > _MOST_BLOCKS:
         raise InputError(
             f"The points fill {np.ptp(points.points, axis=0).max():.0f} mm, too much for cells of"
-            f" {cell_mm:.3g} mm: exclude stray scans."
+            f" {cell_mm:.3g} mm",
+            "exclude stray scans.",
         )
     touched = np.zeros(tuple(shape), bool)
     low, high = (
@@ -181,7 +182,7 @@ def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
     mesh = grid.extract_triangle_mesh(weight_threshold=0.5)
     if not len(mesh.vertex.positions):
         raise InputError(
-            "No surface was found between the points: the cells are too fine for them."
+            "No surface was found between the points", "the cells are too fine for them."
         )
     vertices, faces = _sort_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy())
     return transfer_attributes(points, vertices.astype(np.float64) * cell_mm + origin, faces)

@@ -179,8 +179,8 @@ def build_mesh(
         mesh = grid_mesh(shape)
     elif points.normals is None:
         raise InputError(
-            "These points have no normals: a surface through them needs to know its outside; merge"
-            " the scans again."
+            "These points have no normals",
+            "a surface through them needs to know its outside; merge the scans again.",
         )
     elif method == "volume":
         mesh = volume_surface(points, cell)
@@ -190,7 +190,7 @@ def build_mesh(
         mesh, trimmed = trim_far_patches(mesh, points, cell, limit)
     if not len(mesh.faces):
         raise SlviewerError(
-            "No surface could be laid through the points: merge scans that overlap more."
+            "No surface could be laid through the points", "merge scans that overlap more."
         )
     report(0.6, "excluding floating parts")
     mesh, dropped = drop_small_parts(mesh, SMALL_PART * cell**2)
@@ -221,10 +221,10 @@ def measure_spacing(points: PointSet) -> float:
     if len(points) < 2:
         raise InputError(f"{len(points)} points make no surface.")
     if not np.isfinite(points.points).all():
-        raise InputError("Some points are NaN: select the valid ones first.")
+        raise InputError("Some points are NaN", "select the valid ones first.")
     median_mm = median_spacing(cKDTree(points.points), 20_000)
     if not median_mm > 0:
-        raise InputError("Most points are there twice: merge the scans instead of joining them.")
+        raise InputError("Most points are there twice", "merge the scans instead of joining them.")
     return median_mm
 
 
@@ -238,8 +238,8 @@ def _refuse_if_open(topology: Topology, trimmed: TrimmedPatches | None, method: 
     if trimmed is not None and trimmed.imagined > MOST_IMAGINED:
         raise SlviewerError(
             f"{100 * trimmed.imagined:.0f} % of the closed surface would be imagined, not measured"
-            f" (the largest gap is {trimmed.largest_mm:.0f} mm across): scan the object from more"
-            " sides, or do without watertight."
+            f" (the largest gap is {trimmed.largest_mm:.0f} mm across)",
+            "scan the object from more sides, or do without watertight.",
         )
 
 
@@ -252,8 +252,8 @@ def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
     """
     if not _has_grid(cloud):
         raise InputError(
-            "Merged or imported points have no pixels: the method grid takes a single scan; use"
-            " poisson or volume."
+            "Merged or imported points have no pixels",
+            "the method grid takes a single scan; use poisson or volume.",
         )
     normals = grid_normals(cloud.points)
     cleaned, _ = clean(cloud, normals)
@@ -261,7 +261,7 @@ def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
     faces = triangulate_grid(points)
     if not len(faces):
         raise InputError(
-            "No two neighbouring pixels of this scan lie on a surface: reconstruct it again."
+            "No two neighbouring pixels of this scan lie on a surface", "reconstruct it again."
         )
     along = viewing_cosines(points, normals) * lengths(points) / points[..., 2]
     sigma = (cloud.sigma * along)[cleaned]

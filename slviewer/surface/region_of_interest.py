@@ -35,12 +35,12 @@ class RegionOfInterest:
             values = tuple(float(value) for value in getattr(self, name))
             if len(values) != 3 or not all(abs(value) < _MAX_MM for value in values):
                 raise InputError(
-                    f"the region's {name} is {values}: give three numbers below {_MAX_MM:g}"
+                    f"the region's {name} is {values}", f"give three numbers below {_MAX_MM:g}"
                 )
             object.__setattr__(self, name, values)
         if min(self.size_mm) <= 0:
             raise InputError(
-                f"the region's sides are {_times(self.size_mm)} mm: each must be above 0"
+                f"the region's sides are {_times(self.size_mm)} mm", "each must be above 0"
             )
 
     @classmethod
@@ -55,7 +55,9 @@ class RegionOfInterest:
         without points."""
         flat = points[finite_rows(points)].astype(np.float64)
         if not len(flat):
-            raise InputError("there are no points to put a region around: reconstruct a scan first")
+            raise InputError(
+                "there are no points to put a region around", "reconstruct a scan first"
+            )
         low, high = np.percentile(flat, [OUTLIERS_PERCENT, 100 - OUTLIERS_PERCENT], axis=0)
         margin = MARGIN * max(float(np.linalg.norm(high - low)), 1e-3)
         return cls.between(low - margin, high + margin)
@@ -106,8 +108,8 @@ def crop_mask(name: str, points: np.ndarray, region: RegionOfInterest) -> Mask:
             "xyz", flat.min(axis=0), flat.max(axis=0), strict=True))  # fmt: skip
         raise InputError(
             f"{name}: none of its {len(flat)} points lies in the region of interest of"
-            f" {region.text()}; they span {', '.join(spans)} mm: move or enlarge the region, or"
-            " switch it off (--roi off)"
+            f" {region.text()}; they span {', '.join(spans)} mm",
+            "move or enlarge the region, or switch it off (--roi off)",
         )
     return inside
 

@@ -63,7 +63,7 @@ def select_in_outline(
     """
     corners = np.asarray(outline, np.float64)
     if corners.ndim != 2 or len(corners) < 3 or not np.isfinite(corners).all():
-        raise InputError(f"the outline has {len(corners)} corners: draw at least 3")
+        raise InputError(f"the outline has {len(corners)} corners", "draw at least 3")
 
     def fill(raster: np.ndarray, path: np.ndarray, _: float) -> np.ndarray:
         """Fill the outline."""
@@ -82,7 +82,7 @@ def select_along_path(
     """
     path = np.asarray(path, np.float64)
     if path.ndim != 2 or not len(path) or not np.isfinite(path).all():
-        raise InputError("the brush has no path: draw over the points")
+        raise InputError("the brush has no path", "draw over the points")
 
     def widen(raster: np.ndarray, path: np.ndarray, scale: float) -> np.ndarray:
         """Mark what is within the radius of the path."""
@@ -121,7 +121,7 @@ def select_polygon(shape: tuple[int, ...], corners: np.ndarray) -> Mask:
     corners = np.asarray(corners, np.float64)
     if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2:
         raise InputError(
-            f"a polygon of {corners.size // 2} corners was given: give u v of at least 3"
+            f"a polygon of {corners.size // 2} corners was given", "give u v of at least 3"
         )
     mask = np.zeros(shape[:2], np.uint8)
     cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 1)
@@ -143,7 +143,7 @@ def select_connected(
     u, v = seed
     h, w = valid.shape
     if not (0 <= u < w and 0 <= v < h and valid[v, u]):
-        raise InputError(f"no point was measured at pixel ({u}, {v}): pick one on the surface")
+        raise InputError(f"no point was measured at pixel ({u}, {v})", "pick one on the surface")
     index = np.arange(h * w).reshape(h, w)
     pairs = []
     for down, right in _STEPS:
@@ -188,8 +188,8 @@ def detect_support(
     if share < PLANE_SHARE:
         raise InputError(
             f"no supporting plane: at most {100 * share:.0f} % of the {len(flat)} points lie on one"
-            f" plane to {tolerance:.2f} mm, {100 * PLANE_SHARE:.0f} % are needed: select the points"
-            " with an outline"
+            f" plane to {tolerance:.2f} mm, {100 * PLANE_SHARE:.0f} % are needed",
+            "select the points with an outline",
         )
     if margin_mm is None:
         margin_mm = max(3 * robust_sigma(plane.distance(flat[inliers]), about=0.0), tolerance)
@@ -228,7 +228,7 @@ class Edit:
 
     def __post_init__(self) -> None:
         if (self.pixels is None) == (self.plane is None):
-            raise InputError("an edit deletes pixels, or what is below a plane: give one of them")
+            raise InputError("an edit deletes pixels, or what is below a plane", "give one of them")
 
     @property
     def kind(self) -> Literal["pixels", "plane"]:
@@ -244,8 +244,8 @@ class Edit:
         if self.pixels.shape != points.shape[:2]:
             (h, w), (rows, columns) = self.pixels.shape, points.shape[:2]
             raise InputError(
-                f"the edit {self.what!r} is of {w}x{h} pixels, the scan has {columns}x{rows}: undo"
-                " the edit"
+                f"the edit {self.what!r} is of {w}x{h} pixels, the scan has {columns}x{rows}",
+                "undo the edit",
             )
         return self.pixels
 
@@ -324,7 +324,7 @@ def make_edit(
     """
     count = int(np.count_nonzero(selected & finite_rows(points)))
     if not count:
-        raise InputError("no point is selected: select some first")
+        raise InputError("no point is selected", "select some first")
     return Edit(what, count, selected if plane is None else None, plane, made)
 
 

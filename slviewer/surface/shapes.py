@@ -85,7 +85,7 @@ def _convert_arrays(shape: PointSet | Mesh, n: int) -> None:
             rows = len(array) if name == "faces" else n
             expected = (rows,) if name == "sigma_mm" else (rows, 3)
             if array.shape != expected:
-                raise InputError(f"The {name} have shape {array.shape}: {expected} is needed.")
+                raise InputError(f"The {name} have shape {array.shape}", f"{expected} is needed.")
             vars(shape)[name] = array
 
 

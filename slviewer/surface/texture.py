@@ -87,17 +87,17 @@ def texture_mesh(
     """
     if not SIZES_PX[0] <= size <= SIZES_PX[1]:
         raise InputError(
-            f"a texture of {size} px cannot be made: give {SIZES_PX[0]} to {SIZES_PX[1]}"
+            f"a texture of {size} px cannot be made", f"give {SIZES_PX[0]} to {SIZES_PX[1]}"
         )
     if len(mesh.faces) > MOST_TRIANGLES:
         raise InputError(
-            f"the mesh has {len(mesh.faces):,} triangles, too many to unfold: thin it to"
-            f" {MOST_TRIANGLES:,} or fewer"
+            f"the mesh has {len(mesh.faces):,} triangles, too many to unfold",
+            f"thin it to {MOST_TRIANGLES:,} or fewer",
         )
     for name, scan in scans.items():
         if scan.texture is None:
             raise InputError(
-                f"{name} has no texture: capture it with a white image among its patterns"
+                f"{name} has no texture", "capture it with a white image among its patterns"
             )
     views = {name: prepare_view(name, cloud, T_mesh_scan[name]) for name, cloud in scans.items()}
     gains = colour_gains(views, compare_views(views, lambda share: None)) or {}
@@ -112,7 +112,9 @@ def texture_mesh(
     image, seen = np.zeros((size, size, 3), np.float32), np.zeros((size, size), bool)
     image[chart], seen[chart] = colours, weight > 0
     if not seen.any():
-        raise SlviewerError("no scan shows the surface: do the mesh and the scans belong together?")
+        raise SlviewerError(
+            "no scan shows the surface", "do the mesh and the scans belong together?"
+        )
     share = float(np.mean(weight > 0))
     nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
     image = image[tuple(nearest)]
@@ -144,8 +146,8 @@ def _unfold(mesh: Mesh, size: int) -> tuple[Any, np.ndarray, int]:
         _, charts, _ = unfolded.compute_uvatlas(size=size, gutter=_GUTTER_PX, max_stretch=_STRETCH)
     except RuntimeError as error:
         raise SlviewerError(
-            "the mesh cannot be unfolded, as edges of it join more than two triangles: mesh it with"
-            " the method poisson"
+            "the mesh cannot be unfolded, as edges of it join more than two triangles",
+            "mesh it with the method poisson",
         ) from error
     return unfolded, unfolded.triangle.texture_uvs.numpy().astype(np.float64), int(charts)
 

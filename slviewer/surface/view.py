@@ -91,14 +91,15 @@ def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
     T = np.asarray(T_reference_scan, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError(
-            f"{name}: its pose has shape {T.shape}: fusing needs a finite (4, 4) T_reference_scan."
+            f"{name}: its pose has shape {T.shape}",
+            "fusing needs a finite (4, 4) T_reference_scan.",
         )
     normals = grid_normals(cloud.points)
     surface, cleaned = clean(cloud, normals)
     if np.count_nonzero(surface) < LEAST_POINTS:
         raise InputError(
-            f"{name}: only {np.count_nonzero(surface)} of its pixels lie on a surface: "
-            "reconstruct it again, or exclude it."
+            f"{name}: only {np.count_nonzero(surface)} of its pixels lie on a surface",
+            "reconstruct it again, or exclude it.",
         )
     x, y, width, height = cv2.boundingRect(surface.astype(np.uint8))
     crop = np.s_[y : y + height, x : x + width]
@@ -206,8 +207,8 @@ def _fit_pixel_map(name: str, points: Points, surface: Mask) -> np.ndarray:
     if error_px > _MAX_RMS_PX:
         raise InputError(
             f"{name}: its points do not lie on the lines of sight of one camera at the origin"
-            f" ({error_px:.1f} px off): give the organised cloud in the frame of the camera that"
-            " took it."
+            f" ({error_px:.1f} px off)",
+            "give the organised cloud in the frame of the camera that took it.",
         )
     return np.concatenate([middle, half, coefficients.T.ravel()])
 

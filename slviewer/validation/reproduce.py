@@ -165,7 +165,7 @@ def reproduce(
     if scale is None:
         scale = QUICK_SCALE if quick else 1.0
     elif quick:
-        raise UsageError(f"--quick is --scale {QUICK_SCALE:g}: give one of both")
+        raise UsageError(f"--quick is --scale {QUICK_SCALE:g}", "give one of both")
     check_scale(scale)
     say(_check_disk(out, scale))
     _simulate(session, scale, seed, part(progress, 0.0, 0.4))
@@ -226,7 +226,7 @@ def clean_reproduction(out: Path) -> str:
     session = out / SESSION
     if not _load_truth(session):
         raise InputError(
-            f"{out} holds no session of an earlier run: give its folder with --out, or --quick"
+            f"{out} holds no session of an earlier run", "give its folder with --out, or --quick"
         )
     used_gb = measure_disk_gb(out)
     shutil.rmtree(session)
@@ -249,8 +249,8 @@ def _check_disk(out: Path, scale: float) -> str:
     missing_gb = needed_gb - (measure_disk_gb(out) if out.is_dir() else 0.0)
     if missing_gb > free_gb:
         raise InputError(
-            f"The session takes about {needed_gb:.1f} GB, and {free_gb:.1f} GB are free at {there}:"
-            " choose another folder with --out, or --quick"
+            f"The session takes about {needed_gb:.1f} GB, and {free_gb:.1f} GB are free at {there}",
+            "choose another folder with --out, or --quick",
         )
     return (
         f"The session takes about {needed_gb:.1f} GB in {out.absolute()} ({free_gb:.0f} GB are"
@@ -268,8 +268,8 @@ def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> Non
         with Session.open(session) as store:
             if made or store.capture_names():
                 raise InputError(
-                    f"{session} holds another simulation: choose another folder with --out, or"
-                    " delete it"
+                    f"{session} holds another simulation",
+                    "choose another folder with --out, or delete it",
                 )
         shutil.rmtree(session)  # an interrupted run's, with nothing in it
     simulate(session, scale=scale, seed=seed, progress=progress)

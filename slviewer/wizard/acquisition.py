@@ -287,7 +287,7 @@ class Acquisition(Service):
             if self._view.state != "open":
                 raise DeviceError(self._view.fault or _NOT_OPEN)
             if self._requests or self._view.capture:
-                raise DeviceError("a capture is running: wait for it, or cancel it")
+                raise DeviceError("a capture is running", "wait for it, or cancel it")
             before, self._stream = self._stream, stream
             self._condition.notify_all()
         if before:

@@ -90,8 +90,8 @@ class Autopilot(Service):
             tried += 1
             if tried > 2 * self._poses:
                 raise SlviewerError(
-                    f"only {now.good_poses} of {tried} poses could be used: see why the others were"
-                    " refused"
+                    f"only {now.good_poses} of {tried} poses could be used",
+                    "see why the others were refused",
                 )
             act = now.suggestion.sentence if now.suggestion else "Placing the board"
             self._perform_act(act, operator.place_at_suggestion)

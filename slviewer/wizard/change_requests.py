@@ -125,7 +125,7 @@ class ChangeRequests(Engine):
         store = self._store
         if name and name not in (models := available_models(store)):
             raise InputError(
-                f"the session has no {name} calibration: choose one of {', '.join(models)}"
+                f"the session has no {name} calibration", f"choose one of {', '.join(models)}"
             )
         change = partial(store.decide, "model", name or None)
         self._decide(f"use {name or 'the recommended'} model", "model", change)
@@ -195,7 +195,7 @@ class ChangeRequests(Engine):
         """Put the last region of interest into effect, or use all points."""
         region = load_region(self._store, even_if_off=True)
         if region is None:
-            raise InputError("there is no region yet: take the automatic one of a scan")
+            raise InputError("there is no region yet", "take the automatic one of a scan")
         self._save_region(f"switch the region {'on' if on else 'off'}", region, on)
 
     @request("Setting the region")

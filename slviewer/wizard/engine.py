@@ -110,7 +110,7 @@ class UndoHistory:
                 target.append((name, step()))
             except InputError as error:  # no later attempt would succeed
                 source.pop()
-                raise InputError(f"{name}: {error}") from error
+                raise error.within(name) from error
             source.pop()
             return name
 
@@ -276,7 +276,7 @@ class Engine:
         """The reader of the open session. Raises SessionError where none is open."""
         reader = self._session_reader
         if reader is None:
-            raise SessionError("no session is open: open or create one first")
+            raise SessionError("no session is open", "open or create one first")
         return reader
 
     @property

@@ -236,8 +236,8 @@ class LiveScan(Service):
         model = load_model(store, name)
         if self.axis not in model.axes:
             raise InputError(
-                f"the {name} calibration has no axis {self.axis}, which a live scan needs: capture"
-                " a scan"
+                f"the {name} calibration has no axis {self.axis}, which a live scan needs",
+                "capture a scan",
             )
         self._key, stereo = key, load_stereo(store)
         self._model = LiveModel(

@@ -135,7 +135,7 @@ class Operator(RigRequests, ResultRequests):
             )
             if idle is None:
                 raise SlviewerError(
-                    f"work is still running after {timeout_s:g} s: cancel it, or wait longer"
+                    f"work is still running after {timeout_s:g} s", "cancel it, or wait longer"
                 )
             now = self._publisher.refresh()
             if not now.content.pending_plan and self._publisher.is_current:
@@ -156,7 +156,7 @@ class Operator(RigRequests, ResultRequests):
         """Start an autopilot, which sends requests until it is done or `cancel` stops it."""
         with self._lock:
             if self._autopilot and self._autopilot.running:
-                raise InputError("an autopilot is running already: cancel it first")
+                raise InputError("an autopilot is running already", "cancel it first")
             self._autopilot = autopilot
             autopilot.start()
 
@@ -178,7 +178,7 @@ class Operator(RigRequests, ResultRequests):
         """Capture the board in place of a pose; the old one goes to the trash once the new one is
         saved."""
         if self._store.load_capture(name).role != "calibration":
-            raise InputError(f"{name} is not a target pose: capture another scan instead")
+            raise InputError(f"{name} is not a target pose", "capture another scan instead")
         self._capture_pose(name)
 
     @request("Capturing the scan")
@@ -231,8 +231,8 @@ class Operator(RigRequests, ResultRequests):
         is_there = board is not None and (world is None or world.standing == "board")
         if board and is_there and time.monotonic() - board.time_s < BOARD_S:
             raise InputError(
-                "the board is in view, and would be measured: take it away, or choose to capture"
-                " with the board in view"
+                "the board is in view, and would be measured",
+                "take it away, or choose to capture with the board in view",
             )
 
     def _save_scan(
@@ -298,12 +298,13 @@ class Operator(RigRequests, ResultRequests):
         bench = self._require_bench()
         if bench.reel:
             raise InputError(
-                "a recording holds only its own patterns: choose a real rig or the simulated one"
+                "a recording holds only its own patterns", "choose a real rig or the simulated one"
             )
         if bench.rig.second is not None:
             raise InputError(
-                "Cannot scan live: it takes one camera and its projector, and this rig has two"
-                " cameras. Capture scans one by one."
+                "Cannot scan live",
+                "it takes one camera and its projector, and this rig has two cameras. Capture scans"
+                " one by one.",
             )
         axis = depth_axis(calibration.stereo.rig)
         sequence = replace(short(bench.rig.projector.size, axis), levels=self._reader.levels())
@@ -331,7 +332,7 @@ class Operator(RigRequests, ResultRequests):
         live = self._live
         shot = live.stream.copy_latest() if live and live.is_running else None
         if live is None or shot is None:
-            raise InputError("no live scan runs: start one, and wait for a cloud")
+            raise InputError("no live scan runs", "start one, and wait for a cloud")
         name = self._next_name("scan")
         self._check_space(name, len(shot.frames))
         source = self._acquisition.view().name
@@ -403,7 +404,8 @@ class Operator(RigRequests, ResultRequests):
         path = str(folder).strip()
         if not path:
             raise InputError(
-                "no folder is named: enter the path of a folder on the computer that runs slviewer"
+                "no folder is named",
+                "enter the path of a folder on the computer that runs slviewer",
             )
         self._work(
             IMPORTING,
@@ -456,8 +458,8 @@ class Operator(RigRequests, ResultRequests):
             return
         if suffix not in (*FORMATS, *CALIBRATIONS):
             raise InputError(
-                f"{name} cannot be imported: drop a folder or a zip of captures, a cloud, a mesh,"
-                " or a calibration of OpenCV"
+                f"{name} cannot be imported",
+                "drop a folder or a zip of captures, a cloud, a mesh, or a calibration of OpenCV",
             )
 
         def work(job: Job) -> str:

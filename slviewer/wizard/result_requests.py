@@ -125,7 +125,7 @@ class ResultRequests(ChangeRequests):
         """Run any operation by the name of its command, with its settings."""
         if operation not in OPERATIONS:
             raise InputError(
-                f"there is no operation {operation!r}: choose one of {', '.join(OPERATIONS)}"
+                f"there is no operation {operation!r}", f"choose one of {', '.join(OPERATIONS)}"
             )
         chosen = OPERATIONS[operation]
         self._run(operation.capitalize(), chosen, chosen.settings(**settings))
@@ -302,7 +302,7 @@ class ResultRequests(ChangeRequests):
         before = load_stored(self._store, Measurement, name)
         on, at = before.record.source, before.record.places()
         if before.stale or not at:
-            raise InputError(f"{before.label} has no points on its surface: measure again")
+            raise InputError(f"{before.label} has no points on its surface", "measure again")
         at[end] = place
         settings = MeasureSettings(
             on, cast(Tool, before.record.what), [int(number) for number in np.ravel(at)],
@@ -338,7 +338,8 @@ class ResultRequests(ChangeRequests):
 
         if not name.lower().endswith(".toml"):
             raise InputError(
-                f"{name} is not a plan: choose the .toml file that Make plan or slviewer plan wrote"
+                f"{name} is not a plan",
+                "choose the .toml file that Make plan or slviewer plan wrote",
             )
         self._save_upload("Reading the plan", PLANS, name, content, describe)
 
@@ -367,9 +368,11 @@ class ResultRequests(ChangeRequests):
         into the exports."""
         store = self._store
         if plan not in list_plans(store.folder):
-            raise InputError(f"there is no plan {plan!r} in the session: make or upload one first")
+            raise InputError(
+                f"there is no plan {plan!r} in the session", "make or upload one first"
+            )
         if not surfaces:
-            raise InputError("no scan to inspect: reconstruct one in the step Scan first")
+            raise InputError("no scan to inspect", "reconstruct one in the step Scan first")
         settings = RunPlanSettings(store.folder / plan, surfaces)
         self._run("Running the plan", run_plan, settings, "measurements")
 
@@ -380,7 +383,7 @@ class ResultRequests(ChangeRequests):
         path = self._store.folder / NOMINALS / safe_name(nominal)
         if not path.is_file():
             raise InputError(
-                f"there is no nominal model {nominal!r} in the session: upload it first"
+                f"there is no nominal model {nominal!r} in the session", "upload it first"
             )
         load = partial(surface_to_measure, name=on)
         settings = CompareSettings(on, path, load=load, **inputs)

@@ -144,12 +144,13 @@ def pixel_curve(session: Session, pixel: tuple[int, int], axis: Axis) -> PixelCu
     assert isinstance(model, PixelwiseModel)
     if axis not in model.fits:
         raise InputError(
-            f"the pixel-wise model has no axis {axis}: choose one of {', '.join(model.fits)}"
+            f"the pixel-wise model has no axis {axis}", f"choose one of {', '.join(model.fits)}"
         )
     h, w = model.fits[axis].rms_mm.shape[1:]
     if not (0 <= pixel[0] < w and 0 <= pixel[1] < h):
         raise InputError(
-            f"pixel {pixel} lies outside the camera's {w}x{h}: give column and row, counted from 0"
+            f"pixel {pixel} lies outside the camera's {w}x{h}",
+            "give column and row, counted from 0",
         )
     return curve_at(pixel, model, stereo, load_observations(session, list(stereo.poses)), axis)
 
@@ -175,10 +176,10 @@ def surface_to_measure(store: Session, name: str) -> MeasuredSurface:
     """
     result = name if name.startswith(MERGED) else f"clouds/{name}"
     if not store.has_result(result):
-        raise InputError(f"{name} is not reconstructed: reconstruct it in the step Scan first")
+        raise InputError(f"{name} is not reconstructed", "reconstruct it in the step Scan first")
     again = "merge again" if result == name else "reconstruct it again in the step Scan"
     if not is_up_to_date(store, result):
-        raise InputError(f"the inputs of {name} have changed: {again}, then measure")
+        raise InputError(f"the inputs of {name} have changed", f"{again}, then measure")
     cut = "" if result == name else str(restriction_inputs(store, [name]))
     return _read_surface(store.folder, name, store.load_meta(result)["hash"], cut)
 
@@ -227,7 +228,7 @@ def box_in_view(on: MeasuredSurface, view: ViewCamera, corners: np.ndarray) -> R
     """
     chosen = select_in_outline(on.points, view, corners) & on.measured
     if not chosen.any():
-        raise InputError("the rectangle holds no measured point: drag it over the surface")
+        raise InputError("the rectangle holds no measured point", "drag it over the surface")
     if on.organised:
         off = np.linalg.norm(
             view.project(on.points.astype(np.float64)) - corners.mean(axis=0), axis=-1

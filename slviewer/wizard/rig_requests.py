@@ -56,12 +56,12 @@ class RigRequests(Engine):
         session opens without. Where the session is open already, only the rig changes.
         """
         if not str(path).strip():
-            raise InputError("no folder is named: enter the folder of a session, or of a new one")
+            raise InputError("no folder is named", "enter the folder of a session, or of a new one")
         with self._lock:
             if not self._acquisition.idle:
                 raise InputError(
-                    "a capture is running: wait for it, or cancel it, before you open another"
-                    " session"
+                    "a capture is running",
+                    "wait for it, or cancel it, before you open another session",
                 )
             before = self.session
             is_open = before and expand_user(path).resolve() == before.folder.resolve()
@@ -275,7 +275,7 @@ class RigRequests(Engine):
         preflight = self._shown.preflight
         levels = preflight.levels if preflight else None
         if on and levels is None:
-            raise InputError("no table of grey levels is measured: check the rig first")
+            raise InputError("no table of grey levels is measured", "check the rig first")
         self._store.decide("levels", list(levels) if on and levels else None)
 
     @request("Saving the rig")
@@ -283,7 +283,7 @@ class RigRequests(Engine):
         """Save the rig in use, with its exposure, under a name in the session, where `rig_choice`
         lists it."""
         if self._choice is None:
-            raise InputError("no rig is in use: choose one in the step Rig")
+            raise InputError("no rig is in use", "choose one in the step Rig")
         exposure = {key: value for key, value in self._acquisition.view().exposure.items() if value}
         save_rig(self._store, name, {**self._choice, **exposure}, what)
 
@@ -292,10 +292,12 @@ class RigRequests(Engine):
         """Set what the projector shows between captures: "white", "grey", "dark", or "pattern" to
         focus by."""
         if light not in (*LIGHTS, "pattern"):
-            raise InputError(f"there is no light {light!r}: choose {', '.join(LIGHTS)} or pattern")
+            raise InputError(
+                f"there is no light {light!r}", f"choose {', '.join(LIGHTS)} or pattern"
+            )
         reel = self._bench.reel if self._bench else None
         if light == "dark" and reel and not reel.has_dark:
-            raise InputError("the recording has no dark frame: choose another light")
+            raise InputError("the recording has no dark frame", "choose another light")
         self._acquisition.set_light(light, self._pose_sequence() if light == "pattern" else None)
 
     @request("Choosing the target")
@@ -337,7 +339,7 @@ class RigRequests(Engine):
         default."""
         if sigma_mm is not None and not 0 < sigma_mm < 100:
             raise InputError(
-                f"a standard deviation of {sigma_mm:g} mm is not possible: give one above 0 mm"
+                f"a standard deviation of {sigma_mm:g} mm is not possible", "give one above 0 mm"
             )
         self._store.decide("sigma_wanted_mm", sigma_mm)
 
@@ -350,7 +352,7 @@ class RigRequests(Engine):
         """
         T = None if T_camera_object is None else np.asarray(T_camera_object, float)
         if T is not None and T.shape != (4, 4):
-            raise InputError(f"a pose has the shape {T.shape}: give (4, 4)")
+            raise InputError(f"a pose has the shape {T.shape}", "give (4, 4)")
         self._world.place(thing, None if T is None else Pose(T[:3, :3].copy(), T[:3, 3].copy()))
 
     @request("Placing")
@@ -372,7 +374,7 @@ class RigRequests(Engine):
         """The scene of the simulated rig. Raises InputError where the rig is a real one."""
         if self._scene is None:
             raise InputError(
-                "objects can be placed only before the simulated rig: choose it in the step Rig"
+                "objects can be placed only before the simulated rig", "choose it in the step Rig"
             )
         return self._scene
 
@@ -381,7 +383,7 @@ class RigRequests(Engine):
     def _require_bench(self) -> RigSetup:
         """Return the rig in use. Raises DeviceError where none is chosen."""
         if self._bench is None:
-            raise DeviceError("no rig is chosen: choose one in the step Rig")
+            raise DeviceError("no rig is chosen", "choose one in the step Rig")
         return self._bench
 
     def _require_calibration(self, why: str) -> CalibrationView:

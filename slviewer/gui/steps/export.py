@@ -321,7 +321,7 @@ class ExportPanel(StepPanel):
         try:
             stated["temperature_c"] = float(text) if text else None
         except ValueError as error:
-            raise InputError(f"{text!r} is not a temperature: type °C, such as 20.5") from error
+            raise InputError(f"{text!r} is not a temperature", "type °C, such as 20.5") from error
         if self._operator.set_report_details(**stated):
             self._operator.export("report")
 

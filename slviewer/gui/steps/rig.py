@@ -216,7 +216,7 @@ def _size(text: str) -> list[int]:
     """Parse "1920x1080" to [width, height] px. Raises InputError."""
     sides = text.lower().replace("×", "x").split("x")
     if len(sides) != 2 or not all(side.strip().isdecimal() for side in sides):
-        raise InputError(f"{text!r} is not a size: write width x height in px, such as 1920x1080")
+        raise InputError(f"{text!r} is not a size", "write width x height in px, such as 1920x1080")
     return [int(side) for side in sides]
 
 

@@ -18,8 +18,8 @@ _SIZES = Sizes(4000, 12, 3)
 def _require_package(path: Path) -> None:
     if find_spec("pye57") is None:
         raise InputError(
-            f"{path.name}: .e57 files need the package pye57: install it with pip install"
-            " 'slviewer[e57]'"
+            f"{path.name}: .e57 files need the package pye57",
+            "install it with pip install 'slviewer[e57]'",
         )
 
 
@@ -59,7 +59,7 @@ def _read(path: Path, data: bytes) -> list[Columns]:
     finally:
         file.close()
     if not scans:
-        raise InputError(f"{path.name} holds no scans: export the cloud again")
+        raise InputError(f"{path.name} holds no scans", "export the cloud again")
     return scans
 
 

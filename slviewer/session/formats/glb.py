@@ -35,7 +35,7 @@ def encode_glb(shape: Shape, notes: Sequence[str], texture: Any = None) -> bytes
     size = _SIZES.estimate(len(points), count, colours=True, scalars=0)
     if size > _LIMIT:
         raise InputError(
-            f"{size / 1e9:.1f} GB do not fit into a .glb, which ends at 4.3: write a .ply instead"
+            f"{size / 1e9:.1f} GB do not fit into a .glb, which ends at 4.3", "write a .ply instead"
         )
 
     def describe(tree: dict[str, Any]) -> None:

@@ -34,8 +34,8 @@ def _read(path: Path, data: bytes) -> list[Columns]:
     first = next((i for i, line in enumerate(lines) if _is_row(line)), None)
     if first is None:
         raise InputError(
-            f"{path.name} has no line of three numbers: write x y z of a point a line, with decimal"
-            " points"
+            f"{path.name} has no line of three numbers",
+            "write x y z of a point a line, with decimal points",
         )
     separator = next((each for each in ";," if each in lines[first]), None)
     rows = np.loadtxt(lines[first:], delimiter=separator, comments=("#", "//"), ndmin=2)

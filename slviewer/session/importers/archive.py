@@ -52,11 +52,11 @@ def unpack(
                     shutil.copyfileobj(source, out, 1 << 20)
             except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
                 raise InputError(
-                    f"{info.filename} in the zip is damaged ({error}): make the zip again"
+                    f"{info.filename} in the zip is damaged ({error})", "make the zip again"
                 ) from error
             except FileExistsError as error:
                 raise InputError(
-                    f"the zip holds {info.filename} twice: make the zip again"
+                    f"the zip holds {info.filename} twice", "make the zip again"
                 ) from error
             done += info.file_size
             progress(done / max(total, 1))
@@ -74,7 +74,7 @@ def _open_zip(archive: IO[bytes]) -> zipfile.ZipFile:
         return zipfile.ZipFile(archive)
     except (zipfile.BadZipFile, OSError) as error:
         raise InputError(
-            "the file is not a zip, or is cut short: put the folder of captures into a zip"
+            "the file is not a zip, or is cut short", "put the folder of captures into a zip"
         ) from error
 
 
@@ -91,8 +91,8 @@ def _select_members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], lis
         )
         if outside or stat.S_ISLNK(info.external_attr >> 16):
             raise InputError(
-                f"{info.filename!r} in the zip leads outside of it: make the zip of plain files and"
-                " folders"
+                f"{info.filename!r} in the zip leads outside of it",
+                "make the zip of plain files and folders",
             )
         if info.is_dir() or any(part.startswith((".", "__MACOSX")) for part in path.parts):
             continue
@@ -101,7 +101,7 @@ def _select_members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], lis
             continue
         if info.flag_bits & 1:
             raise InputError(
-                f"{info.filename} in the zip is encrypted: make the zip without a password"
+                f"{info.filename} in the zip is encrypted", "make the zip without a password"
             )
         members.append(info)
     total = sum(info.file_size for info in members)
@@ -112,7 +112,7 @@ def _select_members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], lis
             " the server instead"
         )
     if not members:
-        raise InputError("the zip holds no images: put the folder of captures into a zip")
+        raise InputError("the zip holds no images", "put the folder of captures into a zip")
     return members, others
 
 

@@ -69,9 +69,9 @@ def read_camera_file(path: Path | str, size: tuple[int, int]) -> CameraFile:
     focal, longer = max(K[0, 0], K[1, 1]), max(stated or size)
     if focal < SHORTEST_FOCAL * longer:
         raise InputError(
-            f"{path.name}: a focal length of {focal:.6g} is not in pixels, as an image of"
-            f" {longer} px shows: if it is in mm, divide it and the principal point by the size of"
-            " a pixel in mm"
+            f"{path.name}: a focal length of {focal:.6g} is not in pixels, as an image of {longer}"
+            " px shows",
+            "if it is in mm, divide it and the principal point by the size of a pixel in mm",
         )
     if stated is None:
         notes.append(f"it states no image size: taken as {size[0]}x{size[1]} px")
@@ -79,13 +79,13 @@ def read_camera_file(path: Path | str, size: tuple[int, int]) -> CameraFile:
         if off > MAX_OFF_CENTRE:
             raise InputError(
                 f"{path.name}: its principal point ({K[0, 2]:.0f}, {K[1, 2]:.0f}) px is far from"
-                f" the middle of an image of {size[0]}x{size[1]} px, and it states no image size:"
-                " add image_width and image_height of the images that it was made from"
+                f" the middle of an image of {size[0]}x{size[1]} px, and it states no image size",
+                "add image_width and image_height of the images that it was made from",
             )
     try:
         lens = Lens(K, D, stated or size)
     except InputError as error:
-        raise InputError(f"{path.name}: {error}") from error
+        raise error.within(path.name) from error
     lens = _adapt(lens, size, path.name, notes)
     sigma = found.numbers.get("focalsigmapx")
     return CameraFile(
@@ -105,8 +105,8 @@ def _adapt(lens: Lens, size: tuple[int, int], name: str, notes: list[str]) -> Le
     factor = size[0] / lens.size[0]
     if abs(lens.size[1] * factor - size[1]) > 1:
         raise InputError(
-            f"{name} is of images of {theirs} px, and these are of {ours} px, another shape:"
-            " calibrate the camera alone with the image size and region of interest of the captures"
+            f"{name} is of images of {theirs} px, and these are of {ours} px, another shape",
+            "calibrate the camera alone with the image size and region of interest of the captures",
         )
     notes.append(
         f"it is of {theirs} px, and was scaled to {ours} px: right where the camera scales or bins,"
@@ -132,8 +132,8 @@ def _refuse_other_models(storage: Storage) -> None:
     if named := ", ".join(words + flags):
         raise InputError(
             f"{storage.name} is of another lens model ({named}), which pinhole and Brown's"
-            " distortion (k1 k2 p1 p2 k3) cannot represent: calibrate the camera alone with"
-            " --camera-only"
+            " distortion (k1 k2 p1 p2 k3) cannot represent",
+            "calibrate the camera alone with --camera-only",
         )
 
 
@@ -155,8 +155,8 @@ class _Entries:
         cameras = {key.partition(".")[0] for key in storage.entries if re.match(r"cam\d+\.", key)}
         if len(cameras) > 1:
             raise InputError(
-                f"{storage.name} is of several cameras ({', '.join(sorted(cameras))}): keep the"
-                " block of the one that scans"
+                f"{storage.name} is of several cameras ({', '.join(sorted(cameras))})",
+                "keep the block of the one that scans",
             )
         self.keys = {_plain(key): key for key in storage.entries}
         self.numbers: dict[str, Floats] = {
@@ -198,8 +198,9 @@ class _Entries:
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         else:
             raise InputError(
-                f"{self.name} states no camera matrix: it needs camera_matrix (3x3), or intrinsics"
-                f" (fx fy cx cy); its entries are {', '.join([*self.keys.values()][:30]) or 'none'}"
+                f"{self.name} states no camera matrix",
+                "it needs camera_matrix (3x3), or intrinsics (fx fy cx cy); its entries are"
+                f" {', '.join([*self.keys.values()][:30]) or 'none'}",
             )
         if self.is_matlab:  # which counts pixels from 1
             K[:2, 2] -= 1

@@ -55,7 +55,9 @@ def read_cloud(path: Path | str, unit: Units | None = None) -> tuple[str, list[R
     path = expand_user(path)
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        raise InputError(f"{path.name} is not a cloud that can be read: give {', '.join(FORMATS)}")
+        raise InputError(
+            f"{path.name} is not a cloud that can be read", f"give {', '.join(FORMATS)}"
+        )
     data = read_input(path, MAX_CLOUD_BYTES, "check its name, and that it is below 2 GiB")
     is_mesh = suffix in MESHES
     if suffix == ".ply":
@@ -72,8 +74,8 @@ def read_cloud(path: Path | str, unit: Units | None = None) -> tuple[str, list[R
         raise
     except Exception as error:  # a file from anywhere may make its reader fail in any way
         raise InputError(
-            f"{path.name} cannot be read ({type(error).__name__}: {error}): it is damaged or"
-            " truncated; export the cloud again"
+            f"{path.name} cannot be read ({type(error).__name__}: {error})",
+            "it is damaged or truncated; export the cloud again",
         ) from error
     units = unit or chosen.unit
     return digest_bytes(data).hex(), [_check_points(path.name, each, units) for each in columns]
@@ -97,10 +99,10 @@ def _check_points(name: str, columns: Mapping[str, np.ndarray], unit: Units) -> 
     """Return the columns of a file, whose ``sensor`` is a place, as points without NaN."""
     points = _stack(columns, PLACE)
     if points is None or not len(points):
-        raise InputError(f"{name} holds no points: export the cloud again")
+        raise InputError(f"{name} holds no points", "export the cloud again")
     known = finite_rows(points)
     if not (count := int(known.sum())):
-        raise InputError(f"all {len(points):,} points of {name} are NaN: export the cloud again")
+        raise InputError(f"all {len(points):,} points of {name} are NaN", "export the cloud again")
     dropped = len(known) - count
     notes = [f"{dropped:,} of {len(known):,} points were NaN, and dropped"] if dropped else []
     once = np.unique(points[known], axis=0, return_index=True)[1]
@@ -123,13 +125,14 @@ def check_extent(name: str, points: np.ndarray) -> None:
     """Raise InputError for points (n, 3) mm that are too few, in one place, or too far away."""
     if len(points) < LEAST_POINTS or not diagonal(points) > 0:
         raise InputError(
-            f"{name} holds {len(points)} points, {diagonal(points):.3g} mm across: at least"
-            f" {LEAST_POINTS} in different places are needed"
+            f"{name} holds {len(points)} points, {diagonal(points):.3g} mm across",
+            f"at least {LEAST_POINTS} in different places are needed",
         )
     if not (far := np.abs(points).max()) < MAX_COORDINATE_MM:
         raise InputError(
-            f"{name} reaches {far:.3g} mm: points up to {MAX_COORDINATE_MM:g} mm are read; give its"
-            " --unit, or move it to its origin"
+            f"{name} reaches {far:.3g} mm",
+            f"points up to {MAX_COORDINATE_MM:g} mm are read; give its --unit, or move it to its"
+            " origin",
         )
 
 

@@ -34,10 +34,12 @@ class Storage:
         finite."""
         matrix = self.entries[key]
         if matrix is None:
-            raise InputError(f"{self.name}: {key} is not a matrix of numbers: name the key of one")
+            raise InputError(
+                f"{self.name}: {key} is not a matrix of numbers", "name the key of one"
+            )
         if not np.isfinite(matrix).all():
             raise InputError(
-                f"{self.name}: {key} holds numbers that are not finite: calibrate again"
+                f"{self.name}: {key} holds numbers that are not finite", "calibrate again"
             )
         return matrix
 
@@ -49,8 +51,8 @@ def read_storage(path: Path) -> Storage:
     if status != 0:
         reason = "is no" if status == 1 else "makes OpenCV's parser fail, as it is too large or no"
         raise InputError(
-            f"{path.name} {reason} OpenCV FileStorage file (.yml, .xml or .json): export the"
-            " calibration again"
+            f"{path.name} {reason} OpenCV FileStorage file (.yml, .xml or .json)",
+            "export the calibration again",
         )
     entries, words = json.loads(output)
     return Storage(

@@ -191,7 +191,7 @@ class FrameGroup:
             matches = match_files(folder, name)
             if len(matches) > 1:
                 names = join_names([file.name for file in matches])
-                raise InputError(f'{self.where}: "{name}" matches {names}: name one file')
+                raise InputError(f'{self.where}: "{name}" matches {names}', "name one file")
             files += matches
         return files
 
@@ -202,24 +202,26 @@ def read_groups(name: str, data: Mapping[str, Any]) -> tuple[FrameGroup, ...]:
     single, groups = data.get("frame"), data.get("frames")
     if single is not None and groups is not None:
         raise InputError(
-            f"{name} has [[frame]] and [[frames]] tables, and so no order: use one of the two"
+            f"{name} has [[frame]] and [[frames]] tables, and so no order", "use one of the two"
         )
     ordered = data.get("order")
     if ordered not in (None, "name"):
-        raise InputError(f'{name}: order is {ordered!r}: use "name", or give each entry its files')
+        raise InputError(
+            f"{name}: order is {ordered!r}", 'use "name", or give each entry its files'
+        )
     key, entries, read = (
         ("frames", groups, _read_group) if single is None else ("frame", single, _read_frame)
     )
     if not isinstance(entries, list) or not entries:
         raise InputError(
-            f"{name} names no frames: add a [[frame]] table for each image, or [[frames]] for"
-            " several"
+            f"{name} names no frames",
+            "add a [[frame]] table for each image, or [[frames]] for several",
         )
     parsed = []
     for number, entry in enumerate(entries, 1):
         where = f"{name}, [[{key}]] {number}"
         if not isinstance(entry, Mapping):
-            raise InputError(f"{where} is not a table: write [[{key}]] above its entries")
+            raise InputError(f"{where} is not a table", f"write [[{key}]] above its entries")
         parsed.append(read(where, entry, ordered is not None))
     return tuple(parsed)
 
@@ -228,7 +230,7 @@ def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
     """Read a `[[frame]]` table: one image."""
     if "files" in entry:
         raise InputError(
-            f"{where}: files belongs to [[frames]]: name the one file of a [[frame]] with file"
+            f"{where}: files belongs to [[frames]]", "name the one file of a [[frame]] with file"
         )
     files = _file_names(where, entry.get("file"), ordered)
     where = f"{where} ({files[0]})" if files else where
@@ -243,7 +245,7 @@ def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: exposure_ms: {error}") from error
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise error.within(where) from error
     return FrameGroup(where, (frame,), files, exposure)
 
 
@@ -263,8 +265,8 @@ def _read_group(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
         and len(files) != len(frames)
     ):
         raise InputError(
-            f"{where} names {len(files)} files and describes {len(frames)} images: correct one of"
-            " them"
+            f"{where} names {len(files)} files and describes {len(frames)} images",
+            "correct one of them",
         )
     return FrameGroup(where, frames, files, group.exposure_ms)
 
@@ -274,8 +276,8 @@ def _file_names(where: str, named: Any, ordered: bool) -> tuple[str, ...] | None
     if ordered:
         if named is not None:
             raise InputError(
-                f'{where} names files, and order = "name" takes them in order of their names:'
-                " use one"
+                f'{where} names files, and order = "name" takes them in order of their names',
+                "use one",
             )
         return None
     names = [named] if isinstance(named, str) else named
@@ -285,11 +287,11 @@ def _file_names(where: str, named: Any, ordered: bool) -> tuple[str, ...] | None
         or not all(isinstance(name, str) and name for name in names)
     ):
         raise InputError(
-            f'{where} names no file: add its name in quotes, or order = "name" at the top'
+            f"{where} names no file", 'add its name in quotes, or order = "name" at the top'
         )
     if outside := [name for name in names if Path(name).is_absolute() or ".." in Path(name).parts]:
         raise InputError(
-            f'{where}: "{outside[0]}" lies outside of the capture\'s folder: name files inside it'
+            f'{where}: "{outside[0]}" lies outside of the capture\'s folder', "name files inside it"
         )
     return tuple(names)
 
@@ -318,8 +320,8 @@ class Description:
             matched, count = images_by_name(folder), len(self.files_order)
             if len(matched) != count:
                 raise InputError(
-                    f"it holds {len(matched)} images, and {count} are described: add or remove"
-                    " images"
+                    f"it holds {len(matched)} images, and {count} are described",
+                    "add or remove images",
                 )
         else:
             selected = [group.select(folder) for group in self.groups]
@@ -327,8 +329,8 @@ class Description:
             matched = [file for files in selected for file in files]
             if double := {file.name for file in matched if matched.count(file) > 1}:
                 raise InputError(
-                    f"{join_names(sorted(double))} would show two patterns: correct the patterns of"
-                    " the names"
+                    f"{join_names(sorted(double))} would show two patterns",
+                    "correct the patterns of the names",
                 )
         return tuple(matched[index] for index in self.files_order)
 
@@ -342,14 +344,15 @@ class Description:
             if len(group.files) == 1 and has_wildcard(group.files[0]):
                 raise InputError(
                     f'{len(files)} files match "{group.files[0]}", and {group.where} describes'
-                    f" {len(group.frames)} images: add what is missing, or correct the pattern"
+                    f" {len(group.frames)} images",
+                    "add what is missing, or correct the pattern",
                 )
             names = {file.name for file in files}
             missing += [
                 name for name in group.files if has_wildcard(name) or Path(name).name not in names
             ]
         if missing:
-            raise InputError(f"it lacks {join_names(missing)}, which the TOML names: add them")
+            raise InputError(f"it lacks {join_names(missing)}, which the TOML names", "add them")
 
     def is_capture(self, folder: Path) -> bool:
         """Return whether a folder holds a named file, or more than half of a capture's images."""
@@ -408,17 +411,18 @@ def read_description(toml: Path, projector: tuple[int, int] | None = None) -> De
     data = read_toml(toml)
     if unknown := sorted(set(data) - _KEYS):
         raise InputError(
-            f"{toml.name} has the unknown entry '{unknown[0]}': use {', '.join(sorted(_KEYS))}"
+            f"{toml.name} has the unknown entry '{unknown[0]}'", f"use {', '.join(sorted(_KEYS))}"
         )
     if data.get("channel") not in (None, *get_args(Channel)):
         raise InputError(
-            f"{toml.name}: channel is {data['channel']!r}: use one of"
-            f" {', '.join(get_args(Channel))}"
+            f"{toml.name}: channel is {data['channel']!r}",
+            f"use one of {', '.join(get_args(Channel))}",
         )
     if projector and parse_size(data.get("projector", projector)) != tuple(projector):
         raise InputError(
             f"{toml.name} says that the projector is {data['projector']}, and"
-            f" {projector[0]}x{projector[1]} was given: correct the one that is wrong"
+            f" {projector[0]}x{projector[1]} was given",
+            "correct the one that is wrong",
         )
     left, right = _split_cameras(toml.name, data)
     first = _describe(toml.name, left, projector)
@@ -427,8 +431,8 @@ def read_description(toml: Path, projector: tuple[int, int] | None = None) -> De
     second = _describe(toml.name, right, projector)
     if second.sequence != first.sequence or second.exposures_ms != first.exposures_ms:
         raise InputError(
-            f"{toml.name}: the entries of the left and of the right camera describe other frames:"
-            " both saw the same patterns, in the same order"
+            f"{toml.name}: the entries of the left and of the right camera describe other frames",
+            "both saw the same patterns, in the same order",
         )
     return replace(first, second=second)
 
@@ -448,8 +452,8 @@ def _split_cameras(
     for number, camera in enumerate(named, 1):
         if camera not in CAMERAS:
             raise InputError(
-                f'{name}, [[{key}]] {number}: camera is {camera!r}: write "left" or "right" in'
-                " every entry, or in none"
+                f"{name}, [[{key}]] {number}: camera is {camera!r}",
+                'write "left" or "right" in every entry, or in none',
             )
     left, right = (
         {
@@ -475,7 +479,7 @@ def _describe(name: str, data: Mapping[str, Any], projector: tuple[int, int] | N
         size = {"projector": projector} if projector else {}
         sequence = PatternSequence.from_dict({**data, **size, "frame": shown})
     except InputError as error:
-        raise InputError(f"{name}: {error}") from error
+        raise error.within(name) from error
     return Description(
         sequence, groups, tuple(order), exposures, data.get("channel"), "gray_origin" in data
     )
@@ -490,8 +494,8 @@ def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], li
         return (), list(range(len(frames)))
     if unstated := [frame for frame, exposure in frames if exposure is None]:
         raise InputError(
-            f"{len(unstated)} of {len(frames)} images state no exposure_ms: add it to all, or to"
-            " none"
+            f"{len(unstated)} of {len(frames)} images state no exposure_ms",
+            "add it to all, or to none",
         )
     shown = [[i for i, (_, ms) in enumerate(frames) if ms == exposure] for exposure in exposures]
     wanted, order = [frames[i][0] for i in shown[0]], list[int]()
@@ -499,8 +503,8 @@ def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], li
         there = {frames[i][0]: i for i in indices}
         if set(there) != set(wanted) or len(indices) != len(wanted):
             raise InputError(
-                f"the exposures of {exposures[0]:g} and {exposure:g} ms show other frames: describe"
-                " the whole sequence, each frame once, in every exposure"
+                f"the exposures of {exposures[0]:g} and {exposure:g} ms show other frames",
+                "describe the whole sequence, each frame once, in every exposure",
             )
         order += [there[frame] for frame in wanted]
     return exposures, order

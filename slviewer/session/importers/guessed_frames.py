@@ -41,8 +41,8 @@ def guess_description(
             break
     else:
         raise InputError(
-            f"{source} and the folders in it hold fewer than three images: give the folder of a"
-            " capture"
+            f"{source} and the folders in it hold fewer than three images",
+            "give the folder of a capture",
         )
     images = read_frames(files, channel=channel or DEFAULT_CHANNEL)
     size = None if projector is None else parse_size(projector)

@@ -91,13 +91,13 @@ def read_frames(
         mine, firsts = _short_path(paths[index]), _short_path(paths[0])
         if image.shape[:2] != first.shape[:2]:
             raise InputError(
-                f"{mine} is {_format_size(image)} px, {firsts} is {_format_size(first)}: all"
-                " frames of a capture must have one size"
+                f"{mine} is {_format_size(image)} px, {firsts} is {_format_size(first)}",
+                "all frames of a capture must have one size",
             )
         if image.dtype != first.dtype:
             raise InputError(
-                f"{mine} has {8 * image.itemsize} bits, {firsts} has {8 * first.itemsize}: all"
-                " frames of a capture must have one bit depth"
+                f"{mine} has {8 * image.itemsize} bits, {firsts} has {8 * first.itemsize}",
+                "all frames of a capture must have one bit depth",
             )
         if image.ndim == 2:
             stack[index] = image
@@ -160,7 +160,7 @@ def read_image(path: Path) -> np.ndarray:
     an image."""
     data, name = read_input(path, MAX_IMAGE_BYTES, "check the file"), _short_path(path)
     if not data:
-        raise InputError(f"{name} is empty: copy or record it again")
+        raise InputError(f"{name} is empty", "copy or record it again")
     if is_raw(path):
         return cv2.cvtColor(develop(data, name, MAX_PIXELS).rgb, cv2.COLOR_RGB2BGR)
     width = height = 0
@@ -172,25 +172,27 @@ def read_image(path: Path) -> np.ndarray:
     except Exception as error:  # a malformed file may make Pillow fail in any way
         if data.startswith(_CHECKED):
             raise InputError(
-                f"{name} is damaged or cut short ({error}): copy or record it again"
+                f"{name} is damaged or cut short ({error})", "copy or record it again"
             ) from error
     if width * height > MAX_PIXELS:
         raise InputError(
-            f"{name} is {width}x{height} px, and images of up to"
-            f" {MAX_PIXELS / 1e6:.0f} megapixels are read: crop it, or record it at a lower"
-            " resolution"
+            f"{name} is {width}x{height} px, and images of up to {MAX_PIXELS / 1e6:.0f} megapixels"
+            " are read",
+            "crop it, or record it at a lower resolution",
         )
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, MemoryError):
         pixels = None
     if pixels is None:
-        raise InputError(f"{name} is not a readable image: copy or record it again")
+        raise InputError(f"{name} is not a readable image", "copy or record it again")
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{name} has pixels of type {pixels.dtype}: save frames with 8 or 16 bits")
+        raise InputError(
+            f"{name} has pixels of type {pixels.dtype}", "save frames with 8 or 16 bits"
+        )
     if pixels.ndim == 3 and pixels.shape[2] != 3:
         raise InputError(
-            f"{name} has {pixels.shape[2]} channels: save frames in grey or RGB, without alpha"
+            f"{name} has {pixels.shape[2]} channels", "save frames in grey or RGB, without alpha"
         )
     return pixels
 

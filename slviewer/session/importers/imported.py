@@ -179,7 +179,7 @@ def define_layout(
 
 def missing_projector(what: str) -> InputError:
     """Return the error that the projector's size, on which ``what`` depends, is not known."""
-    return InputError(f"{what} depend on the projector's size: give it with --projector 1280x800")
+    return InputError(f"{what} depend on the projector's size", "give it with --projector 1280x800")
 
 
 def has_wildcard(name: str) -> bool:
@@ -225,7 +225,8 @@ def match_images(
         numbers = tuple(int(group) for group in match.groups())
         if numbers in images:
             raise InputError(
-                f"it holds {images[numbers].name} and {file.name} for one pattern: keep one of them"
+                f"it holds {images[numbers].name} and {file.name} for one pattern",
+                "keep one of them",
             )
         images[numbers] = file
     return dict(sorted(images.items())), others
@@ -241,7 +242,7 @@ def check_complete(
     """
     if not images and not count:
         raise InputError(
-            f"it holds no images {stem}{first:02d} and so on: copy or record them again"
+            f"it holds no images {stem}{first:02d} and so on", "copy or record them again"
         )
     end = first + count if count else max(images)[0] + 1
     if missing := [number for number in range(first, end) if (number,) not in images]:
@@ -255,8 +256,8 @@ def check_complete(
             default=2,
         )
         raise InputError(
-            f"it lacks {stem}{join_names([f'{n:0{digits}d}' for n in missing])}: copy or record"
-            " them again"
+            f"it lacks {stem}{join_names([f'{n:0{digits}d}' for n in missing])}",
+            "copy or record them again",
         )
 
 
@@ -320,7 +321,7 @@ def collect_captures(
         raise none_usable(skipped)
     for name in (names := [recording.name for recording in recordings]):
         if names.count(name) > 1:
-            raise InputError(f"several folders of {source} would be called {name}: rename one")
+            raise InputError(f"several folders of {source} would be called {name}", "rename one")
     return Imports(recordings, warnings, skipped)
 
 
@@ -396,7 +397,7 @@ def list_folders(source: Path) -> list[Path]:
     """The folder, and those right inside it in counting order. InputError where it is none."""
     if not expand_user(source).is_dir():
         raise InputError(
-            f"{source} is not a folder: give the folder of a capture, or a folder of such folders"
+            f"{source} is not a folder", "give the folder of a capture, or a folder of such folders"
         )
     source = Path(os.path.abspath(expand_user(source)))  # a link keeps its own name
     inner = [entry for entry in visible(source) if entry.is_dir()]
@@ -408,7 +409,7 @@ def visible(folder: Path) -> list[Path]:
     try:
         return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
-        raise InputError(f"{folder} cannot be listed ({error}): check its permissions") from error
+        raise InputError(f"{folder} cannot be listed ({error})", "check its permissions") from error
 
 
 def unknown_files_warning(folder: Path, files: Sequence[Path]) -> list[str]:

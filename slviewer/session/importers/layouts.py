@@ -102,7 +102,7 @@ def _read_graycode(
         if len(kinds := {re.sub(r"\d+$", "", file.stem) for file in files}) > 1:
             shown = join_names([f"{kind}N" for kind in sorted(kinds)])
             raise InputError(
-                f'it holds images named {shown}: choose one with --files "{min(kinds)}*"'
+                f"it holds images named {shown}", f'choose one with --files "{min(kinds)}*"'
             )
         shown_sequence = _fit_sequence(sequence, len(files), optional=2)
         files = _order_shadow_images(files, shown_sequence)
@@ -163,8 +163,8 @@ def _order_shadow_images(files: list[Path], sequence: PatternSequence) -> list[P
             else ""
         )
         raise InputError(
-            f"{files[1].name} is not the inverse of {files[0].name}{block}: describe the images in"
-            " a TOML, which `slviewer import frames --guess` proposes"
+            f"{files[1].name} is not the inverse of {files[0].name}{block}",
+            "describe the images in a TOML, which `slviewer import frames --guess` proposes",
         )
     return files if brighter > 0.5 else [*files[:-2], files[-1], files[-2]]
 
@@ -237,18 +237,19 @@ def _describe_p18(
         if extent > _REACH_PX:
             raise InputError(
                 f"{_P18_BITS} Gray bits of {_P18_PERIOD_PX:g} px reach {_REACH_PX:g} px, and the"
-                f" projector has {extent} along {axis}: give the size of the projector that was"
-                " used, or describe the frames in a TOML"
+                f" projector has {extent} along {axis}",
+                "give the size of the projector that was used, or describe the frames in a TOML",
             )
         try:
             images, others = match_images(folder, _P18_FILE)
             check_complete(images, "P18_F", _CODED)
         except InputError as error:
-            raise InputError(f"folder {folder.name}: {error}") from error
+            raise error.within(f"folder {folder.name}") from error
         if extra := [file.name for (number,), file in images.items() if number > max(_TEXTURES)]:
             raise InputError(
                 f"folder {folder.name} holds {join_names(extra)}, beyond the p18 layout's F00 to"
-                " F26: move them away, or describe the frames in a TOML"
+                " F26",
+                "move them away, or describe the frames in a TOML",
             )
         warnings += unknown_files_warning(folder, others)
         files += list(images.values())[:_CODED]
@@ -280,7 +281,8 @@ def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
     found = {_AXES[entry.name.lower()]: entry for entry in there}
     if len(found) < len(there):
         raise InputError(
-            f"it holds {join_names(sorted(entry.name for entry in there))}: keep one folder an axis"
+            f"it holds {join_names(sorted(entry.name for entry in there))}",
+            "keep one folder an axis",
         )
     return [(found[axis], axis) for axis in AXES if axis in found]
 
@@ -347,8 +349,8 @@ def _order_slstudio(
     count = len(images)
     if codec is None and count in _OTHERS:
         raise InputError(
-            f"{count} frames may also be those of {_OTHERS[count]}, which cannot be imported: say"
-            " with --codec what was shown"
+            f"{count} frames may also be those of {_OTHERS[count]}, which cannot be imported",
+            "say with --codec what was shown",
         )
     candidates = [
         (each, axes)
@@ -359,12 +361,12 @@ def _order_slstudio(
     if not candidates:
         what = f"codec {codec}" if codec else "any codec"
         raise InputError(
-            f"it holds {count} frames, which {what} does not show: choose another --codec, or use"
-            " a TOML"
+            f"it holds {count} frames, which {what} does not show",
+            "choose another --codec, or use a TOML",
         )
     if len(candidates) > 1:
         several = join_names([f"{each} along {' and '.join(axes)}" for each, axes in candidates])
-        raise InputError(f"{count} frames may be {several}: choose with --codec")
+        raise InputError(f"{count} frames may be {several}", "choose with --codec")
     ((shown, axes),) = candidates
     cells: PerAxis[float | None] | None = (
         PerAxis(*(_gray_cell(each, projector) for each in AXES)) if shown == "gray" else None
@@ -462,18 +464,19 @@ def detect_layout(source: Path) -> str:
         return candidates[0]
     if candidates:
         raise InputError(
-            f"{source} holds captures of {' and '.join(candidates)}: name the layout, or import one"
-            " at a time"
+            f"{source} holds captures of {' and '.join(candidates)}",
+            "name the layout, or import one at a time",
         )
     if inside := [each for folder in folders[1:] for each in _list_sources(folder, 3)]:
         shown = [quote(str(source / each.relative_to(folders[0]))) for each in inside]
         raise InputError(
-            f"{source} holds no capture itself: give one of the folders in it, {join_names(shown)}"
+            f"{source} holds no capture itself",
+            f"give one of the folders in it, {join_names(shown)}",
         )
     known = "; ".join(f"{layout.name}: {layout.holds}" for layout in layouts().values())
     raise UnknownLayoutError(
-        f"{source} has none of the known layouts ({known}): describe the images in a TOML in the"
-        " folder"
+        f"{source} has none of the known layouts ({known})",
+        "describe the images in a TOML in the folder",
     )
 
 
@@ -497,7 +500,7 @@ def find_description(source: Path) -> Path | None:
     )
     if len(descriptions) > 1:
         raise InputError(
-            f"{source} holds {' and '.join(file.name for file in descriptions)}: keep one"
-            " description"
+            f"{source} holds {' and '.join(file.name for file in descriptions)}",
+            "keep one description",
         )
     return descriptions[0] if descriptions else None

@@ -62,7 +62,7 @@ def read_matrices(
     keys = identify_keys(storage) if keys is None else keys
     if len(keys) != len(ENTRIES):
         raise InputError(
-            f"{len(keys)} keys were given: name those of {' '.join(ENTRIES)}, in this order"
+            f"{len(keys)} keys were given", f"name those of {' '.join(ENTRIES)}, in this order"
         )
     if missing := [key for key in keys if key not in storage.entries]:
         raise InputError(
@@ -94,9 +94,9 @@ def identify_keys(storage: Storage) -> tuple[str, ...]:
     remedy = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {_list_keys(storage)}"
     if matches:
         raise InputError(
-            f"{storage.name} holds {' and '.join(', '.join(row) for row in matches)}: {remedy}"
+            f"{storage.name} holds {' and '.join(', '.join(row) for row in matches)}", remedy
         )
-    raise InputError(f"the entries of {storage.name} have no names that are known here: {remedy}")
+    raise InputError(f"the entries of {storage.name} have no names that are known here", remedy)
 
 
 def read_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
@@ -126,7 +126,7 @@ def _check_intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     try:
         return Lens(matrix, np.zeros(5), (1, 1)).K
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise error.within(where) from error
 
 
 def _check_distortion(matrix: np.ndarray, where: str) -> np.ndarray:
@@ -135,13 +135,14 @@ def _check_distortion(matrix: np.ndarray, where: str) -> np.ndarray:
     size = coefficients.size
     if max(matrix.shape, default=0) != size or size not in (4, 5, 8, 12, 14):
         raise InputError(
-            f"{where} has shape {matrix.shape}: OpenCV's distortion has 4, 5, 8, 12 or 14"
-            " coefficients"
+            f"{where} has shape {matrix.shape}",
+            "OpenCV's distortion has 4, 5, 8, 12 or 14 coefficients",
         )
     if np.any(coefficients[5:]):
         raise InputError(
-            f"{where} has {size} coefficients with rational, prism or tilt terms,"
-            " which k1 k2 p1 p2 k3 cannot represent: calibrate with five coefficients"
+            f"{where} has {size} coefficients with rational, prism or tilt terms, which k1 k2 p1 p2"
+            " k3 cannot represent",
+            "calibrate with five coefficients",
         )
     return np.concatenate([coefficients[:5], np.zeros(max(0, 5 - size))])
 
@@ -150,14 +151,15 @@ def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the rotation (3, 3) nearest to a matrix; InputError where it is far from one."""
     if matrix.shape != (3, 3):
         raise InputError(
-            f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3"
+            f"{where} has shape {matrix.shape}", "the rotation from camera to projector is 3x3"
         )
     nearest = nearest_rotation(matrix)
     error = np.abs(matrix - nearest).max()
     if error > _ROTATION_TOLERANCE:
         raise InputError(
             f"{where} is not a rotation (off by {error:.2g}, determinant"
-            f" {np.linalg.det(matrix):.3g}): check it"
+            f" {np.linalg.det(matrix):.3g})",
+            "check it",
         )
     return nearest
 
@@ -166,15 +168,15 @@ def _check_translation(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the translation (3,) mm; InputError for another shape or an impossible length."""
     if matrix.shape not in ((3, 1), (1, 3), (3,)):
         raise InputError(
-            f"{where} has shape {matrix.shape}: the translation from camera to projector has 3"
-            " numbers"
+            f"{where} has shape {matrix.shape}",
+            "the translation from camera to projector has 3 numbers",
         )
     translation: np.ndarray = matrix.ravel()
     length = math.hypot(*translation)
     if not _SHORTEST_BASELINE_MM <= length <= LARGEST_BASELINE_MM:
         raise InputError(
-            f"{where} is {length:.3g} mm long: give its unit with --unit (mm, cm, m, inch), or"
-            " the translation in mm"
+            f"{where} is {length:.3g} mm long",
+            "give its unit with --unit (mm, cm, m, inch), or the translation in mm",
         )
     return translation
 

@@ -50,8 +50,8 @@ def detect_corners(
             pixels.append(pixel)
     if len(ids) < 4 * 4 and len(ids) < 4 * count:
         raise DetectionError(
-            f"{len(ids) // 4} of {count} tags were detected: bring the whole board into view, in"
-            " focus and evenly lit"
+            f"{len(ids) // 4} of {count} tags were detected",
+            "bring the whole board into view, in focus and evenly lit",
         )
     return np.array(pixels, np.float64), np.array(ids)
 

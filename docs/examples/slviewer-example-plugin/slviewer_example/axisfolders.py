@@ -33,7 +33,7 @@ def describe(
     frames, files, warnings = [], [], []
     for axis, extent in (("x", projector[0]), ("y", projector[1])):
         if not (folder / axis).is_dir():
-            raise InputError(f"it lacks the folder {axis}: copy it again")
+            raise InputError(f"it lacks the folder {axis}", "copy it again")
         images, others = match_images(folder / axis, _FILE)
         check_complete(images, f"{axis}/", count=_STEPS * len(_PARTS))
         for parts in _PARTS:

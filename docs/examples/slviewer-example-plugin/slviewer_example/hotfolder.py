@@ -52,8 +52,8 @@ class HotfolderCamera(Openable):
         """Open the camera. Raises DeviceError if its folder does not exist."""
         if not self._folder.is_dir():
             raise DeviceError(
-                f"{self._folder} is no folder: create it, or name the one that receives the"
-                " pictures"
+                f"{self._folder} is no folder",
+                "create it, or name the one that receives the pictures",
             )
         super().open()
 
@@ -73,8 +73,8 @@ class HotfolderCamera(Openable):
                     return
             time.sleep(0.01)
         raise DeviceError(
-            f"no picture arrived in {self._folder} within {self._timeout_s:g} s: is the program"
-            " that writes them running?"
+            f"no picture arrived in {self._folder} within {self._timeout_s:g} s",
+            "is the program that writes them running?",
         )
 
     def settings(self) -> CameraSettings:
@@ -97,7 +97,7 @@ class HotfolderCamera(Openable):
             subprocess.run(self._trigger, check=True, capture_output=True, timeout=self._timeout_s)
         except (OSError, subprocess.SubprocessError) as error:
             raise DeviceError(
-                f"the trigger {self._trigger[0]} failed ({error}): try it in a terminal"
+                f"the trigger {self._trigger[0]} failed ({error})", "try it in a terminal"
             ) from error
 
     def _copy(self, path: Path, image: np.ndarray, out: np.ndarray) -> None:
@@ -105,7 +105,8 @@ class HotfolderCamera(Openable):
         if image.shape[:2] != out.shape:
             height, width = image.shape[:2]
             raise DeviceError(
-                f"{path.name} is {width}x{height} px: correct the size of the camera, {self.size}"
+                f"{path.name} is {width}x{height} px",
+                f"correct the size of the camera, {self.size}",
             )
         out[:] = image[..., 1]
 
@@ -121,7 +122,7 @@ class HotfolderProjector(Openable):
         self._sequence: PatternSequence | None = None
         if self._file.suffix.lower() != ".png":
             raise InputError(
-                f"{self._file.name} is no PNG: give the projector a file that ends in .png"
+                f"{self._file.name} is no PNG", "give the projector a file that ends in .png"
             )
 
     def open(self) -> None:
@@ -159,7 +160,7 @@ class HotfolderProjector(Openable):
             os.replace(part, self._file)
         except OSError as error:
             raise DeviceError(
-                f"{self._file} cannot be written ({error.strerror}): choose another file"
+                f"{self._file} cannot be written ({error.strerror})", "choose another file"
             ) from error
         time.sleep(self._settle_s)
 

@@ -30,8 +30,8 @@ class TcpTurntable(Openable):
         except OSError as error:
             super().close()
             raise TurntableError(
-                f"{self.name} does not answer at {self._address[0]}:{self._address[1]} ({error}):"
-                " is it switched on?"
+                f"{self.name} does not answer at {self._address[0]}:{self._address[1]} ({error})",
+                "is it switched on?",
             ) from error
 
     def close(self) -> None:
@@ -57,7 +57,8 @@ class TcpTurntable(Openable):
             while state == "MOVING":
                 if time.monotonic() > end:
                     raise TurntableError(
-                        f"{self.name} is still turning after {self._timeout_s:g} s: is it blocked?"
+                        f"{self.name} is still turning after {self._timeout_s:g} s",
+                        "is it blocked?",
                     )
                 check()
                 time.sleep(0.02)
@@ -88,7 +89,7 @@ class TcpTurntable(Openable):
             return state, float(angle)
         except (OSError, ValueError) as error:
             raise TurntableError(
-                f"{self.name} did not answer {line!r} properly ({error}): check its cable"
+                f"{self.name} did not answer {line!r} properly ({error})", "check its cable"
             ) from error
 
 
