@@ -74,8 +74,11 @@ def _judge(
 
 
 def _is_imitated(found: Explanation, evaluator: Evaluator, ghost: bool, motion: bool) -> bool:
-    """Return whether motion, or a ghost, that was measured imitates an explanation."""
-    return (motion and _are_displaced(evaluator, found)) or (ghost and _is_like_ghost(found))
+    """Return whether motion, or a ghost, that was measured imitates an explanation; a ghost does
+    motion, beside which it is measured, and one strange frame, as the first image, which has none
+    before it, stands out."""
+    is_like_ghost = [each.cause for each in found] in (["moved"], ["duplicate-frame"])
+    return (motion and _are_displaced(evaluator, found)) or (ghost and is_like_ghost)
 
 
 def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evaluator:
@@ -99,12 +102,6 @@ def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evalu
         for h in explain(evaluator, base)
     ]
     return evaluator if rivals and max(rivals) < equal.compare(base, base).loss else equal
-
-
-def _is_like_ghost(found: Explanation) -> bool:
-    """Return whether ghosts imitate an explanation: motion, beside which they are measured, and one
-    strange frame, as the first image, which has none before it, stands out."""
-    return [each.cause for each in found] in (["moved"], ["duplicate-frame"])
 
 
 def _are_displaced(evaluator: Evaluator, found: Explanation) -> bool:

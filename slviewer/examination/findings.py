@@ -291,17 +291,24 @@ def describe_mirroring(sequence: PatternSequence, jacobian: np.ndarray) -> Itera
     if np.linalg.det(jacobian) > 0:
         return
     seen = "the projector's coordinates are a mirror image of what the camera sees"
-    if np.abs(np.diag(jacobian[::-1])).sum() > np.abs(np.diag(jacobian)).sum():
+    if (axis := reversed_axis(jacobian)) is None:
         text = f"{seen}, as if x and y were exchanged"
         remedy = mirroring_remedy(REMEDIES["axes-swapped"])
         yield Finding("axes-swapped", "rejected", text, remedy)
         return
-    axis: Axis = "x" if jacobian[0, 0] < 0 else "y"
     text = f"{seen}, as if axis {axis} were reversed"
     remedy = "switch off the projector's mirror or rear mode"
     if not sequence.find("gray", axis):
         remedy += f", or set phase_sign = {-sequence.sign(axis)} for axis {axis}"
     yield Finding("axis-reversed", "rejected", text, mirroring_remedy(remedy), axis=axis)
+
+
+def reversed_axis(jacobian: np.ndarray) -> Axis | None:
+    """Return the axis that is reversed in mirrored coordinates, by their change (2, 2) with the
+    camera's; None where x and y are exchanged."""
+    if np.abs(np.diag(jacobian[::-1])).sum() > np.abs(np.diag(jacobian)).sum():
+        return None
+    return "x" if jacobian[0, 0] < 0 else "y"
 
 
 def mirroring_remedy(of_projector: str) -> str:

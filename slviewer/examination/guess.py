@@ -337,7 +337,8 @@ def _apply_conventions(
         )
     else:
         sequence = _fit_code(sequence, axis, parts, evaluator, findings)
-    explained = _measure_explained(sequence, axis, evaluator)
+    m = evaluator.match(described(sequence), axis)
+    explained = 0.0 if m is None else float(np.mean(m.misfit < limits.GOOD))
     if explained < MOST_EXPLAINED:
         text = f"axis {axis}: {100 * explained:.0f} % of the pixels fit this code"
         findings.doubts.append((images, f"{text}, of {100 * MOST_EXPLAINED:.0f} % at least"))
@@ -350,12 +351,6 @@ def _apply_conventions(
 def _list_images(sequence: PatternSequence, axis: Axis) -> Indices:
     """Return the images that show a pattern along an axis."""
     return tuple(i for i, frame in enumerate(sequence.frames) if frame.axis == axis)
-
-
-def _measure_explained(sequence: PatternSequence, axis: Axis, evaluator: Evaluator) -> float:
-    """Return the share of the pixels that the frames of an axis explain."""
-    m = evaluator.match(described(sequence), axis)
-    return 0.0 if m is None else float(np.mean(m.misfit < limits.GOOD))
 
 
 def _fit_code(

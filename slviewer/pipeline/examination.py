@@ -63,10 +63,10 @@ class Preflight:
     """
 
     checks: tuple[Check, ...]
-    settle_ms: float | None
-    levels: tuple[int, ...] | None
-    exposure_ms: float | None
-    seconds: float
+    settle_ms: float | None = None
+    levels: tuple[int, ...] | None = None
+    exposure_ms: float | None = None
+    seconds: float = 0.0
 
     @property
     def verdict(self) -> CheckVerdict:
@@ -81,7 +81,7 @@ class Preflight:
         joined = []
         for check in self.checks:
             other = others.get(check.name, check)
-            pair = Preflight((check, other), None, None, None, 0.0)
+            pair = Preflight((check, other))
             if other.verdict == pair.verdict != check.verdict:
                 check = structs.replace(other, observation=f"Second camera: {other.observation}")
             joined.append(check)

@@ -132,11 +132,11 @@ def preflight(
     first = _check_camera(alone, say, part(progress, 0.0, 0.5), clock)
     other = replace(alone, camera=rig.second, turntable=None)
 
-    def say_of_second(text: str) -> None:
-        """Report a check of the second camera."""
-        say(f"Second camera: {text}")
-
-    return first.join(_check_camera(other, say_of_second, part(progress, 0.5, 1.0), clock))
+    return first.join(
+        _check_camera(
+            other, lambda text: say(f"Second camera: {text}"), part(progress, 0.5, 1.0), clock
+        )
+    )
 
 
 def _check_camera(rig: Rig, say: Warn, report: Progress, clock: Clock) -> Preflight:
@@ -173,7 +173,7 @@ def _check_camera(rig: Rig, say: Warn, report: Progress, clock: Clock) -> Prefli
         )
         rest = [name for name in _CHECK_ORDER if name not in {check.name for check in checks}]
         checks += [Check(name, "unknown", unseen) for name in rest]
-        return Preflight(tuple(checks), None, None, None, clock.now() - began)
+        return Preflight(tuple(checks), seconds=clock.now() - began)
     add(screen, delay)
     right, exposure_ms = check_exposure(bench)
     add(right)

@@ -206,13 +206,19 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
     )
     present = bench.read_exposure_ms()
     hertz = _identify_mains(white_rest, burst.white_s)
+    # the multiples of the mains period that are nearest to the present exposure, ms
+    exposures_ms = {
+        str(name): round(max(1, round((present or 0.0) * name / 1000)) * 1000 / name, 2)
+        for name in (100, 120)
+        if hertz in (None, name)
+    }
     figures = {
         "rms_in_white": round(swing, 5),
         "rms_in_dark": round(ambient, 5),
         "drift": round(drift, 5),
         "mains_hz": hertz,
         "exposure_ms": present,
-        "exposures_ms": _list_mains_multiples(present, hertz),
+        "exposures_ms": exposures_ms,
     }
     worst = max(swing, ambient)
     if worst <= _UNSTEADY:
@@ -227,35 +233,18 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
             )
         return Check("flicker", "good", f"The light is steady to {100 * worst:.2f} %.", "", figures)
     source = "room's" if ambient > 0.5 * swing else "projector's"
-    named = {100: " (100 Hz)", 120: " (120 Hz)", None: ""}[hertz]
+    named = f" ({hertz} Hz)" if hertz else ""
+    lamps = ", or switch the room's lamps off" if source == "room's" else ""
+    listed = " or ".join(
+        f"{value:g} ms (a multiple of 1/{name} s)" for name, value in exposures_ms.items()
+    )
     return Check(
         "flicker",
         "bad" if worst > _FLICKERS else "warning",
         f"The {source} light flickers by {100 * worst:.1f} % from image to image{named}.",
-        _format_flicker_remedy(present, hertz)
-        + ("" if source == "projector's" else ", or switch the room's lamps off")
-        + ".",
+        f"Set the exposure to {listed}, and less gain or aperture if that is too bright{lamps}.",
         figures,
     )
-
-
-def _format_flicker_remedy(present: float | None, hertz: int | None) -> str:
-    """Text that recommends exposure times in ms, multiples of the mains period."""
-    choices = _list_mains_multiples(present, hertz)
-    listed = " or ".join(
-        f"{value:g} ms (a multiple of 1/{name} s)" for name, value in choices.items()
-    )
-    return f"Set the exposure to {listed}, and less gain or aperture if that is too bright"
-
-
-def _list_mains_multiples(present: float | None, hertz: int | None) -> dict[str, float]:
-    """By frequency in Hz, the multiple of its period in ms that is nearest to the present
-    exposure."""
-    return {
-        str(name): round(max(1, round((present or 0.0) * name / 1000)) * 1000 / name, 2)
-        for name in (100, 120)
-        if hertz in (None, name)
-    }
 
 
 def _remove_drift(values: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, float]:

@@ -1,5 +1,6 @@
 """Is frame k of a capture pattern k?"""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from slviewer.fringe.presets import bits_for, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, Kind, PatternSequence
 from slviewer.pipeline.examination import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
-from slviewer.records.verdict import ORDER_CAUSES, Examination
+from slviewer.records.verdict import ORDER_CAUSES, Examination, Finding
 
 MISPLACING_CAUSES = (*ORDER_CAUSES, "ghosting")
 _STEPS = 12
@@ -59,9 +60,12 @@ def judge_order(sequence: PatternSequence, examination: Examination) -> Check:
         figures["lag"] = int(found[0].value)
     findings = "; ".join(dict.fromkeys(f.observation for f in found[:3]))
     remedy = format_sentence(found[0].remedy)
-    is_rejected = any(f.severity == "rejected" for f in found)
-    verdict: CheckVerdict = "bad" if is_rejected else "warning"
-    return Check("order", verdict, f"Of {n} frames, {findings}.", remedy, figures)
+    return Check("order", rate_findings(found), f"Of {n} frames, {findings}.", remedy, figures)
+
+
+def rate_findings(findings: Iterable[Finding]) -> CheckVerdict:
+    """Return the verdict of a check with findings: bad where one of them rejects the capture."""
+    return "bad" if any(f.severity == "rejected" for f in findings) else "warning"
 
 
 def format_sentence(text: str) -> str:

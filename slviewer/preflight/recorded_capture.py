@@ -42,6 +42,7 @@ from slviewer.preflight.order import (
     check_repeats,
     format_sentence,
     judge_order,
+    rate_findings,
 )
 from slviewer.records.verdict import LIGHT_CAUSES, Cause, Examination
 from slviewer.session.capture import Capture
@@ -83,50 +84,43 @@ def _check_frames(capture: Capture, progress: Progress) -> Preflight:
     progress(0.2, "comparing the frames")
     look = look_at(sequence, frames)
     examination = examine_frames(sequence, frames, capture.files, look)
-    compared = (
-        judge_order(sequence, examination),
-        *_check_steadiness(examination),
-    )
     progress(0.6, "decoding")
+    phases = refusal = None
     try:
         phases = decode_frames("", sequence, frames, look.light)
-    except InputError as error:
-        description = _check_description(examination, error)
-        return Preflight((description, *compared), None, None, None, time.monotonic() - began)
-    repeats = check_repeats(sequence, frames)
-    try:
         check_capture("", sequence, frames, phases, examination)
-        description = _check_description(examination)
     except InputError as error:
-        description = _check_description(examination, error)
-    checks = (
-        description,
-        *compared,
-        structs.replace(
-            repeats, observation=name_frames(repeats.observation, sequence, capture.files)
-        ),
-        check_capture_exposure(sequence, frames, phases),
-        _check_response(sequence, frames, examination),
-        _check_noise(sequence, frames, phases),
-        _check_decoded(phases),
-    )
+        refusal = error
+    checks = [
+        _check_description(examination, refusal),
+        judge_order(sequence, examination),
+        *_check_steadiness(examination),
+    ]
+    if phases is not None:
+        repeats = check_repeats(sequence, frames)
+        named = name_frames(repeats.observation, sequence, capture.files)
+        checks += [
+            structs.replace(repeats, observation=named),
+            check_capture_exposure(sequence, frames, phases),
+            _check_response(sequence, frames, examination),
+            _check_noise(sequence, frames, phases),
+            _check_decoded(phases),
+        ]
     progress(1.0, "checked")
-    return Preflight(checks, None, None, None, time.monotonic() - began)
+    return Preflight(tuple(checks), seconds=time.monotonic() - began)
 
 
-def _check_description(examination: Examination, error: InputError | None = None) -> Check:
+def _check_description(examination: Examination, refusal: InputError | None) -> Check:
     """Check that the frames agree with the description of their patterns, and contradict each other
-    in nothing that another check reports; ``error``: by which they were refused."""
+    in nothing that another check reports; ``refusal``: by which they were refused."""
     others = [f for f in examination.findings if f.cause not in _CAUSES_ELSEWHERE]
-    found = examination.rejected or (() if error else tuple(others))
-    if found:
-        verdict: CheckVerdict = "bad" if examination.rejected else "warning"
-        remedy = "; ".join(dict.fromkeys(f.remedy for f in found))
-        sentence = _join_findings([f.observation for f in found])
-        return Check("description", verdict, sentence, format_sentence(remedy))
-    if error:
-        sentence = format_sentence(error.located_observation)
-        return Check("description", "bad", sentence, format_sentence(error.remedy))
+    if found := examination.rejected or (() if refusal else tuple(others)):
+        observation = _join_findings([f.observation for f in found])
+        remedy = _join_findings([f.remedy for f in found])
+        return Check("description", rate_findings(found), observation, remedy)
+    if refusal:
+        observation = format_sentence(refusal.located_observation)
+        return Check("description", "bad", observation, format_sentence(refusal.remedy))
     return Check("description", "good", "The frames agree with the description of the patterns.")
 
 
@@ -136,7 +130,7 @@ def _check_steadiness(examination: Examination) -> Iterator[Check]:
     figures = {"rms_from_frame_to_frame": round(examination.light_rms, 5)}
     for name, (causes, good, remedy) in _STEADINESS.items():
         known = figures if name == "flicker" else {}
-        if found := _list_sentences(examination, *causes):
+        if found := _list_observations(examination, *causes):
             yield Check(name, "warning", _join_findings(found[:3]), remedy, known)
         else:
             yield Check(name, "good", good, "", known)
@@ -149,7 +143,7 @@ def _check_response(
     remedy = "Straighten the projector's response, or use more steps."
     harmonics = {axis: measure_second_harmonic(sequence, frames, axis) for axis in sequence.axes}
     known = {axis: value for axis, value in harmonics.items() if np.isfinite(value)}
-    if found := _list_sentences(examination, "gamma"):
+    if found := _list_observations(examination, "gamma"):
         return Check("gamma", "warning", _join_findings(found), remedy)
     if not known:
         why = "fewer than five phase steps, or too few pixels that see fringes"
@@ -242,7 +236,7 @@ def _check_decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
     return Check("decoding", verdict, _join_findings(lines), remedy, figures)
 
 
-def _list_sentences(examination: Examination, *causes: Cause) -> list[str]:
+def _list_observations(examination: Examination, *causes: Cause) -> list[str]:
     """List the observations of the findings of these causes."""
     return [f.observation for f in examination.findings if f.cause in causes]
 

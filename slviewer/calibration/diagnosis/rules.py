@@ -19,7 +19,7 @@ from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.squareness import judge_squareness, nearest_aspect
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, MIN_TILT_SPREAD_DEG
-from slviewer.examination.findings import mirroring_remedy
+from slviewer.examination.findings import mirroring_remedy, reversed_axis
 from slviewer.fringe.response import gamma_from_harmonic
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.robust import robust_sigma
@@ -89,19 +89,26 @@ def reason_to_exclude(pose: PoseEvidence, limit_px: float) -> str:
 
     ``limit_px``: the largest motion of a board at rest.
     """
+    match classify_unfit_pose(pose, limit_px):
+        case None:
+            return ""
+        case "board-numbering", shown:
+            return f"its {shown}: uncover the whole board, and capture the pose again"
+        case "moved", shown:
+            return f"{shown} during capture: hold it still, and capture the pose again"
+        case _, shown:
+            return f"its frames are out of order ({shown}): capture the pose again"
+
+
+def classify_unfit_pose(pose: PoseEvidence, limit_px: float) -> tuple[Cause, str] | None:
+    """Return the cause by which a pose is unfit, and what shows it; None where it is fit."""
     if order := classify_frame_order(pose):
-        return f"its frames are out of order ({order[1]}): capture the pose again"
-    if pose.moved_px > limit_px:
-        return (
-            f"the board moved by {pose.moved_px:.2f} px during capture: hold it still, and capture"
-            " the pose again"
-        )
+        return order
     if pose.numbering:
-        return (
-            f"its features are {pose.numbering}: uncover the whole board, and capture the pose"
-            " again"
-        )
-    return ""
+        return "board-numbering", f"features are {pose.numbering}"
+    if pose.moved_px > limit_px:
+        return "moved", f"the board moved by {pose.moved_px:.2f} px"
+    return None
 
 
 def motion_limit_px(poses: Sequence[PoseEvidence]) -> float:
@@ -200,18 +207,17 @@ def diagnose_mirroring(e: Evidence) -> Iterator[Finding]:
     shown = "the camera sees, and the board shows unmirrored" if is_upright else "the camera sees"
     mean = unit_vectors(np.array([*mirrored.values()])).mean(axis=0)
     cause: Cause = "axis-reversed"
-    if abs(np.diag(mean[::-1])).sum() > abs(np.diag(mean)).sum():
+    if (axis := reversed_axis(mean)) is None:
         cause, as_if = "axes-swapped", "x and y were exchanged"
         remedy = (
             "exchange the x and y (V and H) frames in the description of the sequence, or in the"
             " projector"
         )
     else:
-        axis, across, mode, lines = (
-            ("x", "left and right", "rear or mirror", "columns")
-            if mean[0, 0] < 0
-            else ("y", "top and bottom", "flip", "rows")
-        )
+        across, mode, lines = {
+            "x": ("left and right", "rear or mirror", "columns"),
+            "y": ("top and bottom", "flip", "rows"),
+        }[axis]
         as_if = f"its {axis} axis were reversed ({across})"
         remedy = f"switch off the projector's {mode} mode"
         if is_upright:
@@ -426,15 +432,12 @@ def diagnose_single_poses(e: Evidence) -> Iterator[Finding]:
     the others."""
     sentences: dict[Cause, dict[str, str]] = {cause: {} for cause in _POSE_REMEDIES}
     limit_px = motion_limit_px(e.poses)
-    for pose in list_ordered_poses(e):
-        if pose.numbering:
-            sentences["board-numbering"][pose.name] = (
-                f"in {pose.name} the board's features are {pose.numbering}"
-            )
-        elif pose.moved_px > limit_px:
-            sentences["moved"][pose.name] = (
-                f"{pose.name}: the board moved by {pose.moved_px:.2f} px while it was captured"
-            )
+    for pose in e.poses:
+        match classify_unfit_pose(pose, limit_px):
+            case "board-numbering", shown:
+                sentences["board-numbering"][pose.name] = f"in {pose.name} the board's {shown}"
+            case "moved", shown:
+                sentences["moved"][pose.name] = f"{pose.name}: {shown} while it was captured"
     if e.solution is not None:
         explained = {*e.excluded, *sentences["board-numbering"], *sentences["moved"]}
         camera_limit, projector_limit = (

@@ -14,7 +14,7 @@ import numpy as np
 from slviewer.calibration.board_pose import intersect_board, solve_pose
 from slviewer.calibration.diagnosis.evidence import ExcludedPose, Ripple, SolutionEvidence
 from slviewer.calibration.observe import AXES, Observation, Samples
-from slviewer.calibration.squareness import Squareness, measure_squareness
+from slviewer.calibration.squareness import measure_squareness
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import fit_polynomial, fit_slopes, grid_points
@@ -49,6 +49,9 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
     focal = [np.diag(lens.K)[:2] for lens in (stereo.rig.camera, stereo.rig.projector)]
     normals = np.array([T[:3, 2] * np.sign(T[2, 2] or 1) for T in stereo.poses.values()])
     camera, projector = np.median([stereo.pose_rms_px[o.name] for o in used], axis=0).tolist()
+    pixels = [  # of the features that the calibration used
+        np.where(finite_rows(stereo.residuals_px[o.name])[:, None], o.camera, np.nan) for o in used
+    ]
     return SolutionEvidence(
         used=tuple(stereo.poses),
         excluded={
@@ -64,18 +67,13 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
         empty_corners=list_empty_corners(used, stereo),
         aspects=(float(focal[0][1] / focal[0][0]), float(focal[1][1] / focal[1][0])),
         ripple=measure_ripple(used, stereo),
-        squareness=_measure_squareness(used, stereo),
+        squareness=measure_squareness(
+            stereo.rig.camera,
+            [stereo.poses[o.name] for o in used],
+            [o.points for o in used],
+            pixels,
+        ),
     )
-
-
-def _measure_squareness(used: Sequence[Observation], stereo: StereoModel) -> Squareness:
-    """Measure the squareness of the camera's pixels and the board's cells from the features that
-    the calibration used."""
-    pixels = [
-        np.where(finite_rows(stereo.residuals_px[o.name])[:, None], o.camera, np.nan) for o in used
-    ]
-    poses, points = [stereo.poses[o.name] for o in used], [o.points for o in used]
-    return measure_squareness(stereo.rig.camera, poses, points, pixels)
 
 
 def measure_excluded(observation: Observation, stereo: StereoModel) -> ExcludedPose:
