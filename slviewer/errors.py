@@ -4,7 +4,6 @@ Every error states what happened and what to do; both are shown to the operator 
 """
 
 import re
-from copy import copy
 from typing import Self
 
 # up to the last @, as passwords hold all kinds of characters
@@ -45,8 +44,9 @@ class SlviewerError(Exception):
 
     def within(self, place: str) -> Self:
         """Return a copy of the error with a ``place`` in front of its own."""
-        error = copy(self)
-        error.place = ": ".join(filter(None, (place, self.place)))
+        error = type(self).__new__(type(self))  # whatever arguments its constructor takes
+        place = ": ".join(filter(None, (hide_passwords(place), self.place)))
+        vars(error).update(vars(self), place=place)
         return error
 
 

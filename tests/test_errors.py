@@ -5,6 +5,7 @@ import pickle
 import pytest
 
 from slviewer.errors import BoardError, DeviceError, InputError, hide_passwords
+from slviewer.registration.refusal import Refused
 
 
 @pytest.mark.parametrize(
@@ -45,11 +46,16 @@ def test_an_error_is_its_place_observation_and_remedy() -> None:
 def test_parts_of_an_error_hold_no_passwords() -> None:
     address = "rtsp://u:hunter2@camera"
     error = DeviceError(f"{address} is silent", f"open {address}", address)
-    assert not any("hunter2" in part for part in (error.observation, error.remedy, error.place))
+    for each in (error, error.within(address)):
+        assert not any("hunter2" in part for part in (each.observation, each.remedy, each.place))
 
 
 def test_an_error_survives_another_process() -> None:
-    error = pickle.loads(
-        pickle.dumps(BoardError("mirrored", "turn it", "a", cause="axis-reversed"))
-    )
-    assert str(error) == "a: mirrored: turn it" and error.cause == "axis-reversed"
+    error = BoardError("mirrored", "turn it", "a", cause="axis-reversed").within("b")
+    error = pickle.loads(pickle.dumps(error)).within("c")
+    assert str(error) == "c: b: a: mirrored: turn it" and error.cause == "axis-reversed"
+
+
+def test_an_error_with_arguments_of_its_own_is_put_in_a_place() -> None:
+    refused = Refused("overlap", "3 % overlap").within("scan_02")
+    assert str(refused) == "scan_02: 3 % overlap" and refused.reason == "overlap"
