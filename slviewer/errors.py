@@ -44,7 +44,7 @@ class SlviewerError(Exception):
 
     def within(self, place: str) -> Self:
         """Return a copy of the error with a ``place`` in front of its own."""
-        error = type(self).__new__(type(self))  # whatever arguments its constructor takes
+        error = type(self).__new__(type(self), *self.args)  # whatever its constructor takes
         place = ": ".join(filter(None, (hide_passwords(place), self.place)))
         vars(error).update(vars(self), place=place)
         return error
