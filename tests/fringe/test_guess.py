@@ -15,7 +15,6 @@ from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
-from slviewer.examination.guess import guess_sequence
 from slviewer.fringe.presets import (
     AXES,
     bits_for,
@@ -29,6 +28,7 @@ from slviewer.fringe.presets import (
 )
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.importers.frames import read_description
+from slviewer.session.importers.guess import guess_sequence
 from slviewer.simulation.rig import letter
 
 pytestmark = pytest.mark.computes

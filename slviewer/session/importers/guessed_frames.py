@@ -6,8 +6,8 @@ from itertools import groupby
 from pathlib import Path
 
 from slviewer.errors import InputError
-from slviewer.examination.guess import Guess, guess_sequence
 from slviewer.fringe.sequence import Frame, parse_size
+from slviewer.session.importers.guess import Guess, guess_sequence
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
 from slviewer.session.importers.imported import images_by_name, list_folders
 from slviewer.session.names import join_names

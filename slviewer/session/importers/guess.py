@@ -12,16 +12,7 @@ from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, described
 from slviewer.examination.examine import examine
 from slviewer.examination.findings import LINES, wrap
-from slviewer.examination.frame_blocks import (
-    BlockReader,
-    Doubt,
-    FrameBlocks,
-    GrayBlock,
-    PhaseRun,
-    group_frames,
-)
 from slviewer.examination.hypotheses import change_conventions, change_frames
-from slviewer.examination.line_sample import sample_lines
 from slviewer.examination.sample import sample_capture
 from slviewer.fringe.sequence import (
     Axis,
@@ -31,6 +22,15 @@ from slviewer.fringe.sequence import (
     Size,
     select_axis_value,
 )
+from slviewer.session.importers.frame_blocks import (
+    BlockReader,
+    Doubt,
+    FrameBlocks,
+    GrayBlock,
+    PhaseRun,
+    group_frames,
+)
+from slviewer.session.importers.line_sample import sample_lines
 
 ASSUMED_PX = 16.0
 """px of the finest period where nothing states it: a scale, and no measurement."""

@@ -11,9 +11,9 @@ from typing import Literal
 
 import numpy as np
 
-from slviewer.examination.line_sample import LineSample
 from slviewer.fringe.cosines import evaluate_cosine, fit_cosine, measure_concentration
 from slviewer.fringe.sequence import Indices
+from slviewer.session.importers.line_sample import LineSample
 
 MOST_STEPS = 36
 MOST_BITS = 16
