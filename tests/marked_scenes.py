@@ -1,10 +1,10 @@
-"""A sphere and a cylinder with coded markers on their fronts."""
+"""A sphere and a cylinder with coded markers on their fronts, and a plain cylinder."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slviewer.simulation.boards import Pose
-from slviewer.simulation.decals import Decal, MarkedScene, cylinder_mesh
+from slviewer.simulation.decals import Decal, MarkedScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.scenes import sphere
 
@@ -35,3 +35,15 @@ def _stick_on_front(
     R = Rotation.from_euler("yx", turn_deg, degrees=True).as_matrix()
     place = R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0])
     return Decal(number, side_mm, Pose(R, place))
+
+
+def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """An open cylinder along y with facets smaller than the noise: vertices (n, 3) mm, triangles
+    (m, 3)."""
+    around = 720
+    angles = np.arange(around) * 2 * np.pi / around
+    ring = np.stack([radius * np.cos(angles), np.zeros(around), radius * np.sin(angles)], axis=1)
+    vertices = np.concatenate([ring + np.array([0, y, 0]) for y in (-length / 2, length / 2)])
+    i, j = np.arange(around), np.roll(np.arange(around), -1)
+    halves = [np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)]
+    return vertices, np.concatenate(halves)

@@ -79,15 +79,3 @@ def marked_plate(pose: Pose) -> MarkedScene:
         Decal(i, 16.0, Pose(np.eye(3), np.array([x, y, 0.0]))) for i, (x, y) in enumerate(places)
     ]
     return MarkedScene(blank_board(pose), pose, decals)
-
-
-def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """An open cylinder along y with facets smaller than the noise: vertices (n, 3) mm, triangles
-    (m, 3)."""
-    around = 720
-    angles = np.arange(around) * 2 * np.pi / around
-    ring = np.stack([radius * np.cos(angles), np.zeros(around), radius * np.sin(angles)], axis=1)
-    vertices = np.concatenate([ring + np.array([0, y, 0]) for y in (-length / 2, length / 2)])
-    i, j = np.arange(around), np.roll(np.arange(around), -1)
-    halves = [np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)]
-    return vertices, np.concatenate(halves)

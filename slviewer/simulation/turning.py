@@ -10,7 +10,6 @@ from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import rotation
 
 STEPS = 12
-STEP_DEG = 360.0 / STEPS
 AXIS_POINT = np.array([3.0, 6.0, 600.0])
 """On the table's axis, mm in the camera's frame."""
 LOOKING_DOWN_DEG = 30.0

@@ -27,22 +27,18 @@ from slviewer.registration.markers import measure_markers
 from slviewer.registration.multiway import MultiwayAlignment, Starts, register_all
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose, blank_board
-from slviewer.simulation.decals import (
-    MarkedScene,
-    cylinder_mesh,
-    marked_plate,
-)
+from slviewer.simulation.decals import MarkedScene, marked_plate
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import pose_at
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene, sphere
-from slviewer.simulation.turning import STEP_DEG, STEPS, stone
+from slviewer.simulation.turning import STEPS, stone
 from slviewer.surface.fuse import fuse
 from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board
-from tests.marked_scenes import marked_cylinder, marked_sphere
+from tests.marked_scenes import cylinder_mesh, marked_cylinder, marked_sphere
 from tests.proofs.proof import BandCheck, Proof, prove_checks
 from tests.rendered_calibration import calibrate_rendered, scan_sequence
 
@@ -130,7 +126,7 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     # distance the same.
     T_calibrated_camera = fit_rigid(np.concatenate(true), np.concatenate(measured))
     truth = {name: T_calibrated_camera @ scene.pose.matrix for name, scene in scans.items()}
-    angles = {f"turn_{k + 1:02d}": STEP_DEG * k for k in range(STEPS)}
+    angles = {f"turn_{k + 1:02d}": 360.0 * k / STEPS for k in range(STEPS)}
     groups: dict[str, RegisteredScans] = {}
     for kind, reference, starts, begin, end in (
         ("object_", "object_r3", None, 0.75, 0.8),

@@ -10,12 +10,12 @@ from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct, veri
 from slviewer.pipeline.simulate import TARGET
 from slviewer.records.measurement import Measurement
 from slviewer.session.store import Session
-from slviewer.simulation.decals import cylinder_mesh
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import letter_plan, pose_at, rotation
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Rays, Scene, Spheres, Surface, directions_of
 from slviewer.target.board import Board
+from tests.marked_scenes import cylinder_mesh
 from tests.proofs.report_cases.case import BASE_SCALE, Case, Outcome, Workplace
 
 DIAMETER_MM, RADIUS_MM = 196.0, 40.0

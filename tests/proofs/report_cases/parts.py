@@ -27,13 +27,14 @@ from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
-from slviewer.simulation.turning import STEP_DEG, turning
+from slviewer.simulation.turning import STEPS, turning
 from slviewer.surface.fuse import fuse
 from tests.proofs.report_cases.case import BASE_SCALE, Case, Outcome, Workplace
 
 RIG = letter(BASE_SCALE, 0)
 HEIGHT, DEPTH, OFFSET = 20.0, 0.5, 0.4
 PITCH, MOVED, TURNED_DEG = 24.0, 19.0, 25.0
+STEP_DEG = 360.0 / STEPS
 THICKNESS = 2.0
 TOLERANCE = 0.3
 STUDS = Pose(rotation(np.array([np.pi - 0.35, 0.0, 0.0])), np.array([0.0, 0.0, 620.0]))
