@@ -60,14 +60,14 @@ def decode(
         kernels_gray.decode_gray(stack, scale, _pack_gray_rules(layout), maps)
     elif layout.numbers_periods:
         mean = fringe_mean(layout, stack) if layout.is_plain else MIDDLE
-        kernels_coded.decode_coded(
-            stack, pack_shifts(layout), scale, code_rules(layout, mean), maps
-        )
+        coded = pack_shifts(layout), scale, code_rules(layout, mean)
+        kernels.decode_rows(kernels_coded.coded_rows, stack, coded, maps)
     else:
         ladder = pack_levels(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
         ripples, misfit = estimate_level_errors(task)
         ladder = ladder._replace(ripples=ripples, misfit=misfit)
-        kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, maps)
+        levels = pack_shifts(layout), ladder, scale
+        kernels.decode_rows(kernels_levels.levels_rows, stack, levels, maps)
     _repair_spikes(layout, maps[0], maps[-1])
     return complete_map(task, maps, mask_indirect)
 

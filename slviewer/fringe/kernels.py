@@ -5,13 +5,22 @@ once. Loops over a row have no branches and no library calls: the compiler turns
 instructions.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
 from slviewer.fringe.phase import Reason
-from slviewer.geometry.jit import add_fixed_width, fma, prefetch, subtract_fixed_width, to_signed
+from slviewer.geometry.jit import (
+    add_fixed_width,
+    fma,
+    prefetch,
+    read_only,
+    run_rows,
+    subtract_fixed_width,
+    to_signed,
+)
 
 VALID, DARK, SATURATED, INCONSISTENT = (
     np.uint8(r) for r in (Reason.VALID, Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT)
@@ -296,3 +305,23 @@ def allocate_five(width):
     overlap."""
     a, b, c = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return a, b, c, np.empty(width, np.float32), np.empty(width, np.float32)
+
+
+def decode_rows(
+    kernel: Callable[..., Any],
+    stack: np.ndarray,
+    arguments: tuple[Any, ...],
+    maps: tuple[np.ndarray, ...],
+) -> None:
+    """Decode all rows of a stack (n, h, w) by ``kernel(stack, *arguments, first row, *maps)``.
+
+    Fills the five (h, w) ``maps``: phase, wrapped phase, modulation, background and reason. The
+    phase is NaN where the reason is not VALID.
+    """
+    stack = read_only(stack)
+
+    def decode(first: int, last: int) -> None:
+        """Decode a range of rows."""
+        kernel(stack, *arguments, first, *(map[first:last] for map in maps))
+
+    run_rows(decode, stack.shape[1])

@@ -17,8 +17,6 @@ from slviewer.fringe.kernels import (
     TURN,
     TURN_REST,
     ZERO,
-    Scale,
-    Shifts,
     allocate_five,
     is_clipped,
     is_dark,
@@ -27,7 +25,7 @@ from slviewer.fringe.kernels import (
     select_reason,
     shift_row,
 )  # fmt: skip
-from slviewer.geometry.jit import fma, kernel, read_only, run_rows
+from slviewer.geometry.jit import fma, kernel
 
 EDGE, FAR_EDGE = np.float32(limits.EDGE), np.float32(1 - limits.EDGE)
 WEAK, WEAKER, UNDECIDED = (
@@ -254,7 +252,8 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
 
 @kernel()
 def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, background, reason):
-    """Decode rows from ``first`` on, see `decode_coded`; the five maps contain only these rows."""
+    """Decode rows from ``first`` on by a phase shift of one period with a plain or complementary
+    Gray code, see `kernels.decode_rows`; the five maps contain only these rows."""
     width, steps = stack.shape[2], select_period(shifts, 0)
     peak, code, buffers = (
         np.empty(width, stack.dtype),
@@ -265,20 +264,3 @@ def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, b
         row, psi, B, A = first + i, wrapped[i], modulation[i], background[i]
         shift_row(stack, steps, row, psi, B, A, peak)
         coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase[i], reason[i])
-
-
-def decode_coded(
-    stack: np.ndarray, shifts: Shifts, scale: Scale, rules: CodeRules, maps: tuple[np.ndarray, ...]
-) -> None:
-    """Decode the phase shift of one period with a plain or complementary Gray code.
-
-    Fills the five (h, w) ``maps``: phase, wrapped phase, modulation, background and reason. The
-    phase is NaN where the reason is not VALID, here as in the other kernels.
-    """
-    stack = read_only(stack)
-
-    def decode(first: int, last: int) -> None:
-        """Decode a range of rows."""
-        coded_rows(stack, shifts, scale, rules, first, *(map[first:last] for map in maps))
-
-    run_rows(decode, stack.shape[1])

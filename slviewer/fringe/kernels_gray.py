@@ -34,7 +34,7 @@ def decode_gray(
 ) -> None:
     """Decode the projector's column or row from Gray bits alone.
 
-    Fills the five (h, w) ``maps``, see `kernels_coded.decode_coded`; the wrapped phase is NaN.
+    Fills the five (h, w) ``maps``, see `kernels.decode_rows`; the wrapped phase is NaN.
     """
     run_rows(_decode_gray_rows, stack.shape[1], read_only(stack), scale, rules, *maps)
 

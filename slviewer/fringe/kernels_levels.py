@@ -12,8 +12,6 @@ from slviewer.fringe.kernels import (
     TURN,
     TURN_REST,
     ZERO,
-    Scale,
-    Shifts,
     allocate_five,
     arctan2,
     is_dark_squared,
@@ -22,7 +20,7 @@ from slviewer.fringe.kernels import (
     sums_row,
 )
 from slviewer.fringe.kernels_coded import UNDECIDED, WEAK, WEAKER
-from slviewer.geometry.jit import fma, kernel, read_only, run_rows
+from slviewer.geometry.jit import fma, kernel
 
 PER_RAD = 1 / (2 * np.pi)
 
@@ -227,7 +225,9 @@ def add_ripple_row(psi, ripple):
 def levels_rows(
     stack, shifts, ladder, scale, first, phase, wrapped, modulation, background, reason
 ):
-    """Decode rows from ``first`` on, see `decode_levels`; the five maps contain only these rows."""
+    """Decode rows from ``first`` on by several periods, each with its own phase steps, and Gray
+    cells, if any; see `kernels.decode_rows`. The five maps, of the finest period, contain only
+    these rows."""
     count, width, bits = len(shifts.steps), stack.shape[2], len(ladder.bits)
     psi, peak, buffers = (
         np.empty((count, width), np.float32),
@@ -259,19 +259,3 @@ def levels_rows(
             phase[i],
             reason[i],
         )
-
-
-def decode_levels(
-    stack: np.ndarray, shifts: Shifts, ladder: Ladder, scale: Scale, maps: tuple[np.ndarray, ...]
-) -> None:
-    """Decode several periods, each by its own phase steps, and Gray cells, if any.
-
-    Fills the five (h, w) ``maps`` of the finest period; see `kernels_coded.decode_coded`.
-    """
-    stack = read_only(stack)
-
-    def decode(first: int, last: int) -> None:
-        """Decode a range of rows."""
-        levels_rows(stack, shifts, ladder, scale, first, *(map[first:last] for map in maps))
-
-    run_rows(decode, stack.shape[1])

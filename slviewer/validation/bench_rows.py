@@ -17,8 +17,10 @@ from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.calibration.splined.compiled import DEPTHS, GRID_CELLS_ACROSS, CompiledAxis
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.evaluation.render import Row
-from slviewer.fringe import kernels_coded, kernels_levels
 from slviewer.fringe.decode import code_rules, grey_scale, pack_levels, pack_shifts
+from slviewer.fringe.kernels import decode_rows
+from slviewer.fringe.kernels_coded import coded_rows
+from slviewer.fringe.kernels_levels import levels_rows
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.sequence import PatternSequence
@@ -156,9 +158,9 @@ def prepare_kernel(sequence: PatternSequence, frames: np.ndarray) -> Callable[[]
     shifts = pack_shifts(layout)
     if not layout.gray:
         ladder = pack_levels(layout)
-        return lambda: kernels_levels.decode_levels(frames, shifts, ladder, scale, maps)
+        return lambda: decode_rows(levels_rows, frames, (shifts, ladder, scale), maps)
     rules = code_rules(layout, fringe_mean(layout, frames))
-    return lambda: kernels_coded.decode_coded(frames, shifts, scale, rules, maps)
+    return lambda: decode_rows(coded_rows, frames, (shifts, scale, rules), maps)
 
 
 def make_calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledAxis, np.ndarray]:
