@@ -211,7 +211,7 @@ def _length_budget(
     mm = scale.length_mm
     name = SIZE if artefact.spacing is None else SPACING
     errors = np.array([f.error_mm for p in test.positions for f in p.figures if f.property == name])
-    noise = float(np.sqrt(np.mean([p.noise_mm**2 for p in test.positions])))
+    noise = rms([p.noise_mm for p in test.positions])
     scatter = None if len(errors) < 2 else float(np.sqrt(max(errors.var(ddof=1) - noise**2, 0.0)))
     # known, not removed
     uncorrected_ppm = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0

@@ -12,7 +12,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.vectors import shared_rms, subsample
+from slviewer.geometry.vectors import finite_rows, rms_length, shared_rms, subsample
 from slviewer.records.calibration import Reprojection, is_pattern
 from slviewer.records.verification import Verification
 from slviewer.report.page import (
@@ -469,10 +469,10 @@ def residual_arrows(
     magnified, at most ``MOST_ARROWS``; consecutive ones are neighbours, and the caption says
     whether these agree."""
     shared = shared_rms(residuals)
-    known = np.isfinite(pixels).all(axis=1) & np.isfinite(residuals).all(axis=1)
+    known = finite_rows(pixels, residuals)
     at, away = pixels[known], residuals[known]
     lengths = np.hypot(away[:, 0], away[:, 1])
-    rms = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else np.nan
+    rms = rms_length(away) if len(away) else np.nan
     # round_up(NaN) is 1
     scale = round_up(0.05 * size[0] / max(percentile(lengths, 95), 1e-3))
     drawing, axes = _new_image_axes(size, f"{title}: RMS {rms:.3f} px")
@@ -523,7 +523,7 @@ def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> 
     coverage_count = np.zeros((size[1], size[0]), np.uint8)
     hulls = []
     for pixels in poses:
-        known = pixels[np.isfinite(pixels).all(axis=1)].astype(np.float32)
+        known = pixels[finite_rows(pixels)].astype(np.float32)
         if len(known) < 3:
             continue
         hull = cv2.convexHull(known)[:, 0]
