@@ -36,141 +36,36 @@ evaluation, inspection, simulation, devices, session, report, pipeline, prefligh
 gui, validation, and the command line at the end. A package imports only from those before it.
 """
 
+import ast
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from slviewer import plugins
-    from slviewer.devices.capture import capture_frames
-    from slviewer.devices.simulated import simulated_rig
-    from slviewer.devices.world import SimulatedWorld
-    from slviewer.errors import SlviewerError
-    from slviewer.evaluation.fit import evaluate_plane, evaluate_sphere
-    from slviewer.examination.examine import examine
-    from slviewer.fringe.decode import decode, texture
-    from slviewer.fringe.phase import PhaseMap, Reason
-    from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
-    from slviewer.fringe.sequence import Frame, PatternSequence, one_axis
-    from slviewer.gui.viewer import show
-    from slviewer.operations.batch import batch
-    from slviewer.pipeline import datasets
-    from slviewer.pipeline.accept import accept, check
-    from slviewer.pipeline.calibrate import (
-        CalibrationResult,
-        calibrate,
-        calibrate_frames,
-        save_calibration,
-    )
-    from slviewer.pipeline.capture import capture
-    from slviewer.pipeline.compare import compare
-    from slviewer.pipeline.export import export
-    from slviewer.pipeline.import_captures import import_captures, read_captures
-    from slviewer.pipeline.import_cloud import import_cloud
-    from slviewer.pipeline.inspect_parts import run_plan
-    from slviewer.pipeline.measure import measure
-    from slviewer.pipeline.merge import align, merge
-    from slviewer.pipeline.mesh import mesh
-    from slviewer.pipeline.models import load_calibration
-    from slviewer.pipeline.operation import load_arrays
-    from slviewer.pipeline.reconstruct import reconstruct, verify
-    from slviewer.pipeline.report import report
-    from slviewer.pipeline.session_operations import SessionOperations as Session
-    from slviewer.pipeline.simulate import simulate
-    from slviewer.reconstruction.cloud import Cloud
-    from slviewer.reconstruction.reconstruct import reconstruct_cloud
-    from slviewer.records.measurement import Measurement, Quantity
-    from slviewer.records.verification import Verification
-    from slviewer.registration.multiway import register_all as align_clouds
-    from slviewer.report.maps import draw_error_maps
-    from slviewer.session.ply import read_ply, write_ply
-    from slviewer.simulation.boards import Pose
-    from slviewer.simulation.rig import letter as letter_rig
-    from slviewer.surface.fuse import fuse as fuse_clouds
-    from slviewer.surface.meshing import MeshingPlan
-    from slviewer.surface.meshing import build_mesh as mesh_cloud
-    from slviewer.target.board import Board
-    from slviewer.target.detect import detect as detect_board
+from pathlib import Path
+from typing import Any
 
 try:  # written by the build from the git tag
     from slviewer._version import version as __version__
 except ImportError:  # a checkout that was never built or installed
     __version__ = "0.2.0.dev0"
 
+_STUB = Path(__file__).with_suffix(".pyi").read_text("utf-8")
 _EXPORTS = {
-    "Board": "target.board",
-    "CalibrationResult": "pipeline.calibrate",
-    "Cloud": "reconstruction.cloud",
-    "Frame": "fringe.sequence",
-    "Measurement": "records.measurement",
-    "MeshingPlan": "surface.meshing",
-    "PatternSequence": "fringe.sequence",
-    "PhaseMap": "fringe.phase",
-    "Pose": "simulation.boards",
-    "Quantity": "records.measurement",
-    "Reason": "fringe.phase",
-    "Session": "pipeline.session_operations:SessionOperations",
-    "SimulatedWorld": "devices.world",
-    "SlviewerError": "errors",
-    "Verification": "records.verification",
-    "align": "pipeline.merge",
-    "align_clouds": "registration.multiway:register_all",
-    "batch": "operations.batch",
-    "calibrate_frames": "pipeline.calibrate",
-    "capture_frames": "devices.capture",
-    "check": "pipeline.accept",
-    "complementary": "fringe.presets",
-    "datasets": "pipeline.datasets:*",
-    "decode": "fringe.decode",
-    "detect_board": "target.detect:detect",
-    "draw_error_maps": "report.maps",
-    "evaluate_plane": "evaluation.fit",
-    "evaluate_sphere": "evaluation.fit",
-    "examine": "examination.examine",
-    "fuse_clouds": "surface.fuse:fuse",
-    "gray": "fringe.presets",
-    "letter_rig": "simulation.rig:letter",
-    "load_arrays": "pipeline.operation",
-    "load_calibration": "pipeline.models",
-    "mesh_cloud": "surface.meshing:build_mesh",
-    "micro": "fringe.presets",
-    "multifrequency": "fringe.presets",
-    "one_axis": "fringe.sequence",
-    "p18": "fringe.presets",
-    "plugins": "plugins:*",
-    "read_captures": "pipeline.import_captures",
-    "read_ply": "session.ply",
-    "reconstruct_cloud": "reconstruction.reconstruct",
-    "run_plan": "pipeline.inspect_parts",
-    "save_calibration": "pipeline.calibrate",
-    "show": "gui.viewer",
-    "simulated_rig": "devices.simulated",
-    "texture": "fringe.decode",
-    "verify": "pipeline.reconstruct",
-    "write_ply": "session.ply",
+    each.asname or each.name: (node.module, each.name)
+    for node in ast.walk(ast.parse(_STUB))
+    if isinstance(node, ast.ImportFrom)
+    for each in node.names
 }
-"""{public name: module}, or module:name where it has another name there, or module:* for the module
-itself; the others are in the module of ``slviewer.pipeline`` that has their name."""
+"""{public name: its module, and its name there}."""
 
-__all__ = [
-    "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "MeshingPlan",
-    "PatternSequence", "PhaseMap", "Pose", "Quantity", "Reason", "Session", "SimulatedWorld",
-    "SlviewerError", "Verification", "accept", "align", "align_clouds", "batch", "calibrate",
-    "calibrate_frames", "capture", "capture_frames", "check", "compare", "complementary",
-    "datasets", "decode", "detect_board", "draw_error_maps", "evaluate_plane",
-    "evaluate_sphere", "examine", "export", "fuse_clouds", "gray", "import_captures",
-    "import_cloud", "letter_rig", "load_arrays", "load_calibration", "measure", "merge", "mesh",
-    "mesh_cloud", "micro", "multifrequency", "one_axis", "p18", "plugins", "read_captures",
-    "read_ply", "reconstruct", "reconstruct_cloud", "report", "run_plan", "save_calibration",
-    "show", "simulate", "simulated_rig", "texture", "verify", "write_ply",
-]  # fmt: skip
+__all__ = sorted(_EXPORTS)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _EXPORTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, original = _EXPORTS.get(name, f"pipeline.{name}").partition(":")
-    imported = import_module(f"{__name__}.{module}")
-    return imported if original == "*" else getattr(imported, original or name)
+    module, original = _EXPORTS[name]
+    imported = vars(import_module(module))
+    if original not in imported:  # a module itself
+        return import_module(f"{module}.{original}")
+    return imported[original]
 
 
 def __dir__() -> list[str]:
