@@ -108,11 +108,9 @@ def colour_merge(
     surface, spread = result_views.merged_cloud(session, merge.name), None
     if colour == DISTANCE and surface.normals is not None:
         aligned = []
-        for name in merge.record.scans:
+        for name, T in merge.record.poses.items():
             if not session.has_result(f"clouds/{name}"):  # deleted since
                 continue
-            pair = merge.record.pairs.get(name)
-            T = np.eye(4) if pair is None else np.array(pair.T_reference_scan)
             measured = result_views.load_scan_cloud(session, name).measured
             aligned.append(move_points(T, measured))
         spread = measure_spread(surface.points, surface.normals, aligned)

@@ -281,12 +281,11 @@ def _merge_entry(store: Session, each: Stored[Merge]) -> dict[str, Any]:
     made = each.record
     model = made.model if made.model in available_models(store) else "stereo"
     projector = np.linalg.inv(_projector_transform(store, model))
-    scans = []
+    scans, poses = [], made.poses
     for scan in made.scans:
-        pair = made.pairs.get(scan)
-        T = np.eye(4) if pair is None else np.array(pair.T_reference_scan, float)
+        T = poses[scan]
         entry = {"name": scan, "T_reference_scan": T, "T_reference_projector": T @ projector}
-        figures = ((key, getattr(pair, key, None)) for key in _FIGURES)
+        figures = ((key, getattr(made.pairs.get(scan), key, None)) for key in _FIGURES)
         scans.append(entry | {key: value for key, value in figures if value is not None})
     return {"name": each.name, "reference": made.reference, "model": made.model, "scans": scans}
 

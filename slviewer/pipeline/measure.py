@@ -213,12 +213,13 @@ def load_merged_surface(
     """A stored merge, in the frame of its reference's camera; ``roi`` as in `read_merge`."""
     record, points = read_merge(store, merge, warn, roi)
     sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))
-    poses = [np.eye(4), *(np.array(pair.T_reference_scan) for pair in record.pairs.values())]
     return MeasuredSurface(
         points.points, sigma, merge, record.model, store.input_hashes(merge),
         normals=points.normals, faces=points.faces, texture=points.colours,
         scale=record.scales.get(record.model, 1.0),
-        views=[move_points(T, view) for view in device_centres(store) for T in poses],
+        views=[
+            move_points(T, view) for view in device_centres(store) for T in record.poses.values()
+        ],
     )  # fmt: skip
 
 

@@ -226,13 +226,11 @@ def _textured_scans(
     made = load_record(store, Merge, merge_name(store, source.removeprefix(MERGED)))
     for name in made.scans:
         store.load_capture(name).require_frames("texture")
-    placed = {made.reference: np.eye(4)}
-    placed |= {name: np.array(pair.T_reference_scan) for name, pair in made.pairs.items()}
     used = made.model or settings.model
     job = Job(store, warn=settings.warn, accept_rejected=settings.accept_rejected)
     # what lies outside of the region still hides the surface from a scan
     clouds = {name: scan_cloud(job, name, used, OFF) for name in made.scans}
-    return clouds, placed
+    return clouds, made.poses
 
 
 def _balance_cloud(name: str, cloud: Cloud, gains: np.ndarray) -> Cloud:

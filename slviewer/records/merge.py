@@ -367,6 +367,12 @@ class Merge(Record, frozen=True, kw_only=True):
     depths: dict[str, DepthCheck] = {}
 
     @property
+    def poses(self) -> dict[str, np.ndarray]:
+        """T_reference_scan (4, 4) mm of each scan, the reference first."""
+        placed = {name: np.array(pair.T_reference_scan) for name, pair in self.pairs.items()}
+        return {self.reference: np.eye(4), **placed}
+
+    @property
     def is_good(self) -> bool:
         """Whether the scans are within the calibrated depths."""
         return not self.depths

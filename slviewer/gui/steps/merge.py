@@ -1,7 +1,6 @@
 """Step 7: choose scans, the reference and the initial alignment; merge, and compare before with
 after."""
 
-import numpy as np
 import viser
 
 from slviewer.gui.colouring import ALIGNED_COLOURINGS, DISTANCE, MERGE_COLOURINGS
@@ -227,11 +226,7 @@ class MergePanel(StepPanel):
         """Request the clouds of the chosen view: the merged surface, or these scans."""
         merge, view, context = self.session.merge, self._view.value, self.context
         colour = self._colour.value
-        poses = (
-            {n: np.array(p.T_reference_scan) for n, p in merge.record.pairs.items()}
-            if merge and view == AFTER
-            else {}
-        )
+        poses = merge.record.poses if merge and view == AFTER else {}
         key = (
             view,
             colour,
