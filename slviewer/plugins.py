@@ -251,7 +251,7 @@ def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> Itera
     if len(imports) != 1:
         yield f"read finds {len(imports)} captures in {capture}, which is one"
     for recording in imports.recordings:
-        expected = len(recording.sequence.frames) * max(1, len(recording.exposures_ms))
+        expected = recording.sequence.count_images(recording.exposures_ms)
         if len(recording.files) != expected:
             yield f"{recording.name}: {len(recording.files)} images for {expected} frames"
             continue

@@ -1,7 +1,7 @@
 """Description of the projected patterns, frame by frame."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any, Generic, Literal, NamedTuple, TypeVar, get_args
@@ -196,6 +196,11 @@ class PatternSequence:
         for axis in self.axes:
             self._check_phase(axis)
             self._check_bits(axis)
+
+    def count_images(self, exposures: Sized) -> int:
+        """Return the number of images of a capture in these exposures; in one where none are
+        given."""
+        return len(self.frames) * max(1, len(exposures))
 
     @property
     def projector(self) -> Size:

@@ -171,8 +171,8 @@ def capture(settings: CaptureSettings) -> Capture:
         target = Board.parse(notation) if notation else None
         bench, sequence = set_up_rig(store, choice, target, settings)
         exposures = settings.exposures
-        most = MAX_SUGGESTED if settings.auto_exposure else max(1, len(exposures))
-        check_space(store, bench.rig.cameras, len(sequence.frames) * most, name)
+        most = sequence.count_images(range(MAX_SUGGESTED) if settings.auto_exposure else exposures)
+        check_space(store, bench.rig.cameras, most, name)
         begin = 0.3 if settings.auto_exposure else 0.0
         with bench.rig.opened() as devices:
             set_camera(devices, choice, settings)
@@ -435,7 +435,7 @@ def turn(settings: TurnSettings) -> Turn:
         place_object(bench)
         if (stereo := load_stereo_if_complete(store)) is not None:
             sequence = one_axis(sequence, depth_axis(stereo.rig))  # half of the frames
-        frames = len(sequence.frames) * max(1, len(exposures)) * len(todo)
+        frames = sequence.count_images(exposures) * len(todo)
         check_space(store, bench.rig.cameras, frames, "the turn")
         with bench.rig.opened() as devices:
             set_camera(devices, choice, settings)

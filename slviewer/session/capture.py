@@ -127,7 +127,7 @@ class Capture:
         """
         self.require_frames("decode")
         stored = FrameStack.open(self.folder / "frames.zarr")
-        n, (width, height) = len(self.sequence.frames) * max(1, len(self.exposures_ms)), self.size
+        n, (width, height) = self.sequence.count_images(self.exposures_ms), self.size
         if (shape := stored.shape) != (n, height, width):
             raise DamagedError(
                 f"{self.name}: {self.folder} is damaged: its description states {n} frames of"
@@ -342,7 +342,7 @@ class NewCapture:
             raise InputError(
                 f"exposures of {list(exposures)} ms", "give two or more, each once, or none"
             )
-        if len(self.frames) != len(self.sequence.frames) * max(1, len(exposures)):
+        if len(self.frames) != self.sequence.count_images(exposures):
             times = f" in {len(exposures)} exposures" if exposures else ""
             raise InputError(
                 f"{shape[0]} frames for a sequence of {len(self.sequence.frames)}{times}",

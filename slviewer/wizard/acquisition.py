@@ -251,7 +251,7 @@ class Acquisition(Service):
         """Queue a capture, in each of the exposures where there are any; `save(captured)` is called
         with it, on this thread. Its frames are overwritten by the next one. Raises DeviceError
         where no rig is open."""
-        frames = len(sequence.frames) * max(1, len(exposures_ms))
+        frames = sequence.count_images(exposures_ms)
 
         def work(rig: Rig, _: Progress) -> None:
             """Capture the frames, and save them."""

@@ -261,7 +261,7 @@ class Operator(RigRequests, ResultRequests):
     ) -> None:
         """Queue a capture. Raises SessionError where the disk is too full."""
         reel, exposures = self._require_bench().reel, self._reader.exposures_ms()
-        self._check_space(name, len(sequence.frames) * max(1, len(exposures)))
+        self._check_space(name, sequence.count_images(exposures))
 
         def finish(captured: CapturedFrames) -> None:
             """Save the capture, and advance a replayed recording."""
@@ -370,8 +370,7 @@ class Operator(RigRequests, ResultRequests):
         bench = self._require_bench()
         require_turntable(bench.rig)
         exposures, recorded = self._reader.exposures_ms(), recorded_steps(store, turn)
-        frames = len(sequence.frames) * max(1, len(exposures))
-        self._check_space(turn, frames * len(steps))
+        self._check_space(turn, sequence.count_images(exposures) * len(steps))
         place_object(bench)
 
         def work(rig: Rig, progress: Progress) -> None:

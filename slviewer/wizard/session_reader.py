@@ -109,8 +109,7 @@ class SessionReader:
         unknown."""
         if rig.projector is None:
             return None
-        frames = PRESETS[self.patterns()](rig.projector).frames
-        return len(frames) * max(1, len(self.exposures_ms()))
+        return PRESETS[self.patterns()](rig.projector).count_images(self.exposures_ms())
 
     def levels(self) -> tuple[int, ...] | None:
         """Return the table of grey levels that linearises the projector; None where it is not
