@@ -16,6 +16,7 @@ from slviewer.calibration.diagnosis.rules import (
 from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY
 from slviewer.calibration.squareness import judge_squareness, measure_squareness
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, check_pose_count
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats, largest_angle_deg, move_points
 from slviewer.geometry.vectors import rms_length
@@ -86,7 +87,7 @@ class CameraCalibration:
 def calibrate_camera(
     board: Board,
     detections: Mapping[str, Detection],
-    size: tuple[int, int],
+    size: Size,
     excluded: Mapping[str, str] | None = None,
 ) -> CameraCalibration:
     """Calibrate a pinhole camera with Brown distortion (k1 k2 p1 p2 k3) from pictures of a board.
@@ -130,7 +131,7 @@ def calibrate_camera(
 
 
 def _solve_camera(
-    points: list[Floats], pixels: list[Floats], size: tuple[int, int]
+    points: list[Floats], pixels: list[Floats], size: Size
 ) -> tuple[Lens, list[Floats], tuple[float, float]]:
     """Solve the camera's lens from points (n, 3) mm and pixels (n, 2) by picture, as
     ``solve_device`` does.

@@ -30,7 +30,7 @@ from scipy.special import fdtrc, fdtri
 from slviewer.calibration.board_pose import intersect_board, solve_pose
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, Mask, move_points, rigid_transform
 from slviewer.geometry.robust import robust_sigma, tukey_weights
@@ -117,7 +117,7 @@ class DisplacementField:
     """A cubic B-spline displacement field over an image of ``size`` px: ``cells`` (across,
     down)."""
 
-    size: tuple[int, int]
+    size: Size
 
     @property
     def cells(self) -> tuple[int, int]:

@@ -44,6 +44,7 @@ from slviewer.calibration.splined.unknowns import (
     UnknownLayout,
     board_frame,
 )
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
@@ -227,7 +228,7 @@ def estimate_rig(
     points: Sequence[Floats],
     camera: Sequence[Floats],
     projector: Sequence[Floats],
-    sizes: tuple[tuple[int, int], tuple[int, int]],
+    sizes: tuple[Size, Size],
 ) -> tuple[StereoRig, list[Floats]] | None:
     """Estimate an approximate rig and T_camera_board (4, 4) mm of every pose; None where the poses
     do not determine it.
@@ -262,7 +263,7 @@ def estimate_rig(
 
 
 def _calibrate_device(
-    points: Sequence[Floats], pixels: Sequence[np.ndarray], size: tuple[int, int]
+    points: Sequence[Floats], pixels: Sequence[np.ndarray], size: Size
 ) -> tuple[Lens | None, list[Floats]]:
     """Estimate a lens and T_device_board (4, 4) mm of each pose; None without a plausible
     solution."""

@@ -15,6 +15,7 @@ import scipy
 
 from slviewer.calibration.board_pose import solve_pose
 from slviewer.errors import InputError
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rigid import Floats, Mask, move_points, rigid_transform
@@ -80,16 +81,14 @@ class Suggestion:
     sentence: str
 
 
-def nominal_lens(size: tuple[int, int], focal_px: float | None = None) -> Lens:
+def nominal_lens(size: Size, focal_px: float | None = None) -> Lens:
     """Return a lens without distortion; without `focal_px` a typical focal length is assumed."""
     width, height = size
     f = focal_px or NOMINAL_FOCAL * width
     return Lens.from_parameters((f, f, (width - 1) / 2, (height - 1) / 2), size)
 
 
-def estimated_lens(
-    points: Sequence[Floats], pixels: Sequence[Floats], size: tuple[int, int]
-) -> Lens:
+def estimated_lens(points: Sequence[Floats], pixels: Sequence[Floats], size: Size) -> Lens:
     """Estimate a lens of one focal length, undistorted, from points (n, 3) mm and pixels (n, 2) of
     several boards.
 
@@ -128,7 +127,7 @@ def count_coverage(board: Board, lens: Lens, poses: Sequence[Floats]) -> Coverag
     return Coverage(covered.sum(axis=0), depths, tilts, depth_range(board, lens))
 
 
-def count_cells(poses: Sequence[Floats], size: tuple[int, int]) -> np.ndarray:
+def count_cells(poses: Sequence[Floats], size: Size) -> np.ndarray:
     """Count the poses with features, at pixels (n, 2), in each cell (3, 4) of an image of ``size``
     (width, height)."""
     counts = np.zeros((ROWS, COLUMNS), int)
@@ -207,7 +206,7 @@ def describe_suggestion(board: Board, lens: Lens, T_camera_board: Floats) -> Sug
     return Suggestion(T_camera_board, corners, f"{attitude}, {THIRDS[thirds[0]]}, {place}")
 
 
-def projector_reach(points: Floats, pixels: Floats, size: tuple[int, int]) -> Illumination | None:
+def projector_reach(points: Floats, pixels: Floats, size: Size) -> Illumination | None:
     """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and
     pixels (n, 2).
 

@@ -24,7 +24,7 @@ import numpy as np
 from slviewer.calibration.local_fit import fit_local_values
 from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
 from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.robust import RAYLEIGH_MEDIAN
@@ -94,7 +94,7 @@ class BoardPlane:
     reach: Floats
 
     @classmethod
-    def fit(cls, camera: Floats, projector: Floats, size: tuple[int, int]) -> "BoardPlane | None":
+    def fit(cls, camera: Floats, projector: Floats, size: Size) -> "BoardPlane | None":
         """Fit the map from camera to projector that a plane makes, robustly, to features at
         ``camera`` and ``projector`` pixels (n, 2), NaN where unknown.
 
@@ -257,7 +257,7 @@ class Observation:
     projector: Floats
     surfaces: Mapping[Axis, SplineSurface | Polynomial2D]
     periods_px: Mapping[Axis, float]
-    size: tuple[int, int]
+    size: Size
     box: tuple[int, int, int, int]
     packed_region: np.ndarray = field(repr=False)
     slopes: Floats | None = field(default=None, repr=False)

@@ -14,7 +14,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.errors import CalibrationRejected
 from slviewer.examination.findings import mirroring_remedy
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import fit_slopes
 from slviewer.geometry.rig import StereoRig
@@ -186,7 +186,7 @@ class StereoModel:
 
 def calibrate_stereo(
     observations: Sequence[Observation],
-    projector_size: tuple[int, int],
+    projector_size: Size,
     board: str = "",
     excluded: Mapping[str, str] | None = None,
     *,
@@ -249,7 +249,7 @@ def calibrate_stereo(
 def _solve(
     used: Sequence[Observation],
     inliers: Mapping[str, Mask],
-    projector_size: tuple[int, int],
+    projector_size: Size,
     strict: bool,
     camera: KnownCamera | None,
 ) -> StereoModel:
@@ -298,7 +298,7 @@ def _solve(
 
 def _solve_both(
     views: Views,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
+    sizes: tuple[Size, Size],
     strict: bool,
     camera: KnownCamera | None,
 ) -> tuple[StereoRig, list[Floats], dict[str, float]]:

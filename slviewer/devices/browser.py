@@ -33,7 +33,7 @@ from slviewer.devices.protocols import (
 )
 from slviewer.errors import DeviceError
 from slviewer.fringe.patterns import profile
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence, Size
 
 FRAME_S = 10.0
 """How long a picture may take, from the request until it has arrived here."""
@@ -79,7 +79,7 @@ class Video(msgspec.Struct, frozen=True):
     exposure_ms: _Milliseconds | None
     visible: bool
 
-    def refusal(self, size: tuple[int, int] | None) -> str:
+    def refusal(self, size: Size | None) -> str:
         """Return why pictures of `size` (width, height; None: any) cannot be taken there, with a
         remedy; else ""."""
         if self.size is None:
@@ -259,7 +259,7 @@ class Screen(msgspec.Struct, frozen=True):
         return self.full or self.inner == self.whole
 
     @property
-    def size(self) -> tuple[int, int]:
+    def size(self) -> Size:
         """(width, height) device px of the window if it is full screen, else of the screen."""
         width, height = self.inner if self.full_screen else self.whole
         return round(width * self.dpr), round(height * self.dpr)
@@ -273,7 +273,7 @@ class Screen(msgspec.Struct, frozen=True):
         # a ratio that developer tools emulate is not in the box, which is then in page pixels
         return near and self.box in (None, whole, self.inner)
 
-    def refusal(self, size: tuple[int, int] | None) -> str:
+    def refusal(self, size: Size | None) -> str:
         """Return why patterns of `size` (width, height; None: unknown) cannot be shown there, with
         a remedy; else ""."""
         if not self.visible:

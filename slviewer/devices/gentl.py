@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.sequence import Size
 
 PRODUCERS_VARIABLE = "GENICAM_GENTL64_PATH"
 """Names the folders of all producers that are installed."""
@@ -207,7 +208,7 @@ class Image:
     copied."""
 
     data: np.ndarray
-    size: tuple[int, int]
+    size: Size
     padding: int
 
 
@@ -322,9 +323,7 @@ class Link:
                 _return_buffer(buffer)
 
     @contextlib.contextmanager
-    def next(
-        self, timeout_s: float, nbytes: Callable[[tuple[int, int], int], int]
-    ) -> Iterator[Image]:
+    def next(self, timeout_s: float, nbytes: Callable[[Size, int], int]) -> Iterator[Image]:
         """Yield the next image; `nbytes(size, padding)`: bytes required. Raises DeviceError for an
         incomplete one."""
         buffer = self._wait_buffer(timeout_s)
@@ -357,7 +356,7 @@ class Link:
                 )
             time.sleep(_POLL_S)
 
-    def _read_image(self, buffer: Any, nbytes: Callable[[tuple[int, int], int], int]) -> Image:
+    def _read_image(self, buffer: Any, nbytes: Callable[[Size, int], int]) -> Image:
         """Read from the raw buffer: harvesters' own components unpack into copies, and keep the
         rows' padding."""
         nodes = self.node_map

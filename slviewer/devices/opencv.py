@@ -33,6 +33,7 @@ from slviewer.devices.protocols import (
     extract_channel,
 )
 from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.sequence import Size
 
 UNKNOWN = -1.0
 """What OpenCV says for a control that it does not know (`getProperty` of every backend)."""
@@ -181,7 +182,7 @@ def describe_source(source: int | str) -> str:
 
 
 def connect_source(
-    source: int | str, size: tuple[int, int] | None, timing: StreamTiming = TIMING
+    source: int | str, size: Size | None, timing: StreamTiming = TIMING
 ) -> Connected:
     """Open a source, a webcam at `size` (width, height) px where supported. Raises DeviceError.
 
@@ -253,7 +254,7 @@ def list_sysfs_webcams(sysfs: Path) -> list[str]:
     return lines
 
 
-def _open_webcam(source: int | str, size: tuple[int, int] | None) -> Connected:
+def _open_webcam(source: int | str, size: Size | None) -> Connected:
     """Open a webcam by the first backend that works, at `size` if supported. Raises DeviceError."""
     for backend in _WEBCAMS:
         capture = cv2.VideoCapture(source, backend)
@@ -272,7 +273,7 @@ def _open_webcam(source: int | str, size: tuple[int, int] | None) -> Connected:
     return Connected(capture, live=True, grab_waits=backend != cv2.CAP_DSHOW)
 
 
-def _set_size(capture: cv2.VideoCapture, size: tuple[int, int]) -> bool:
+def _set_size(capture: cv2.VideoCapture, size: Size) -> bool:
     """Switch to `size`; returns whether the camera supports it."""
     sides = dict(zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), size, strict=True))
     for side, pixels in sides.items():
@@ -322,7 +323,7 @@ class OpenCVCamera(CameraDriver):
     """
 
     source: int | str = 0
-    size: tuple[int, int] = None  # type: ignore[assignment]  # until it is known
+    size: Size = None  # type: ignore[assignment]  # until it is known
     exposure_ms: float | None = None
     gain: float | None = None
     focus: float | None = None

@@ -20,6 +20,7 @@ import msgspec
 
 from slviewer.devices.protocols import Openable, check_image_size
 from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.sequence import Size
 
 ANSWER_S = 1.8
 """A page that is alive answers within two animation frames; a request ends within two seconds
@@ -34,10 +35,10 @@ class PageFacts(Protocol):
     """What a kind of page reports of itself."""
 
     @property
-    def size(self) -> tuple[int, int] | None:
+    def size(self) -> Size | None:
         """The (width, height) px of the page's screen or camera."""
 
-    def refusal(self, size: tuple[int, int] | None) -> str:
+    def refusal(self, size: Size | None) -> str:
         """Return why the page cannot be a device of this size (None: unknown), with a remedy; ""
         where it can."""
 
@@ -77,7 +78,7 @@ class PageState:
 
     state: Literal["waiting", "refused", "ready"]
     words: str
-    size: tuple[int, int] | None = None
+    size: Size | None = None
 
 
 @dataclass(eq=False)
@@ -153,9 +154,9 @@ class PageChannel(ABC, Generic[Facts]):
         self._condition = threading.Condition()
         self._answer_s = answer_s
         self._page: PageConnection[Facts] | None = None
-        self._wanted_size: tuple[int, int] | None = None
+        self._wanted_size: Size | None = None
 
-    def set_size(self, size: tuple[int, int] | None) -> None:
+    def set_size(self, size: Size | None) -> None:
         """Judge pages by pictures or patterns of this size (width, height) from now on; None: of
         any."""
         with self._condition:

@@ -26,6 +26,7 @@ from slviewer.devices.protocols import (
     extract_channel,
 )
 from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.sequence import Size
 
 _ANSWER_S = 3.0
 _MOST_FRAMES = 20
@@ -49,7 +50,7 @@ def _as_device_error(name: str) -> Iterator[None]:
         raise DeviceError(f"{name} does not answer ({reason})", _CHECK) from error
 
 
-def _open_camera(number: int, size: tuple[int, int] | None) -> tuple[Any, dict[str, Any]]:
+def _open_camera(number: int, size: Size | None) -> tuple[Any, dict[str, Any]]:
     """Return the camera, open and configured, and its raw stream's actual "format", "size" and
     "stride"."""
     from picamera2 import Picamera2
@@ -79,7 +80,7 @@ def _open_camera(number: int, size: tuple[int, int] | None) -> tuple[Any, dict[s
 
 
 @cache
-def _describe_stream(number: int, size: tuple[int, int] | None) -> tuple[tuple[int, int], str]:
+def _describe_stream(number: int, size: Size | None) -> tuple[Size, str]:
     """Return size and format of a camera's raw stream, once: it cannot be opened twice."""
     camera, raw = _open_camera(number, size)
     camera.close()
@@ -107,7 +108,7 @@ class PiCamera(CameraDriver):
     """
 
     number: int = 0
-    size: tuple[int, int] = None  # type: ignore[assignment]  # until it is known
+    size: Size = None  # type: ignore[assignment]  # until it is known
     exposure_ms: float = 10.0
     gain: float = 1.0
     focus: float | None = None

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.sequence import Size
 
 _NAME = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG)|RGBa?|BGRa?)(8|10|12|14|16)(p|Packed)?")
 _COLOURS = ("RGB", "RGBa", "BGR", "BGRa")
@@ -51,7 +52,7 @@ class PixelFormat:
         """Samples per pixel."""
         return len(self.kind) if self.kind in _COLOURS else 1
 
-    def nbytes(self, size: tuple[int, int], padding: int = 0) -> int:
+    def nbytes(self, size: Size, padding: int = 0) -> int:
         """Return the bytes of an image (width, height) px whose rows end with `padding` bytes;
         seamless lines at 0."""
         width, height = size
@@ -84,7 +85,7 @@ class PixelFormat:
         else:
             np.copyto(out.reshape(rows, used // 2), np.ascontiguousarray(lines).view("<u2"))
 
-    def view_samples(self, data: np.ndarray, size: tuple[int, int], padding: int = 0) -> np.ndarray:
+    def view_samples(self, data: np.ndarray, size: Size, padding: int = 0) -> np.ndarray:
         """Return a buffer's samples (h, w), or (h, w, samples), of `dtype`: a view where they need
         no unpacking."""
         width, height = size

@@ -14,7 +14,7 @@ import numpy as np
 
 from slviewer.errors import DeviceError, InputError, SlviewerError
 from slviewer.fringe.layout import clip_level
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import PatternSequence, Size
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Camera(Protocol):
         """The operator's name for it, to start a sentence with, such as "the simulated camera"."""
 
     @property
-    def size(self) -> tuple[int, int]:
+    def size(self) -> Size:
         """(width, height) px of its frames."""
 
     @property
@@ -156,7 +156,7 @@ def check_channel(channel: str) -> None:
         )
 
 
-def check_image_size(what: str, size: Sequence[int], most_px: int = 2**16) -> tuple[int, int]:
+def check_image_size(what: str, size: Sequence[int], most_px: int = 2**16) -> Size:
     """Return the (width, height) px of `what`, a camera or a projector. Raises InputError for
     anything else."""
     if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= most_px for side in size):
@@ -184,7 +184,7 @@ class Projector(Protocol):
         """The operator's name for it, to start a sentence with."""
 
     @property
-    def size(self) -> tuple[int, int]:
+    def size(self) -> Size:
         """(width, height) px."""
 
     def open(self) -> None:
@@ -407,7 +407,7 @@ class CameraDriver(Openable):
     """A camera that is opened before it is used, and whose frames fit what they are written to:
     `_fill`, `_read_settings` and `_write_settings` are called of an open one only."""
 
-    size: tuple[int, int]
+    size: Size
     dtype: np.dtype
 
     def grab(self, out: np.ndarray) -> None:

@@ -33,7 +33,7 @@ from slviewer.errors import (
 from slviewer.examination.light import look_at
 from slviewer.fringe.decode import texture
 from slviewer.fringe.layout import axis_layout
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import PatternSequence, Size
 from slviewer.geometry.lens import Lens
 from slviewer.inputs import Input
 from slviewer.pipeline.capture_phases import capture_texture, convert_to_8bit, decode_or_explain
@@ -353,7 +353,7 @@ def _changes_calibration(
 
 
 def _load_camera(
-    store: Session, settings: CalibrateSettings, size: tuple[int, int], warn: Warn
+    store: Session, settings: CalibrateSettings, size: Size, warn: Warn
 ) -> KnownCamera | None:
     """Load the camera that the settings name for images of ``size`` (width, height) px, and save it
     in the session, from where a repetition loads it; None where they name none."""
@@ -386,7 +386,7 @@ def _diagnose_poses(
     poses: Iterable[Judged],
     count: int,
     sequence: PatternSequence,
-    other_size: tuple[int, int],
+    other_size: Size,
     board: Board,
     excluded: Mapping[str, str],
     progress: Progress,
@@ -544,7 +544,7 @@ def calibrate_camera_alone(
     chosen = match_names([*pictures], poses, "picture") if poses else [*pictures]
     chosen = [name for name in chosen if name not in without]
     detections, excluded = dict[str, Detection](), dict[str, str]()
-    size: tuple[int, int] | None = None
+    size: Size | None = None
     for i, name in enumerate(chosen):
         progress(i / len(chosen), f"detecting the board in {name}")
         image = _read_picture(pictures[name])

@@ -22,7 +22,7 @@ from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.phase import Reason
-from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
+from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, Size, parse_size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_examined
@@ -65,7 +65,7 @@ from slviewer.session.nominal import MM, Units
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 
-Size = str | tuple[int, int]
+GivenSize = str | Size
 Keys = tuple[str, str, str, str, str, str]
 MAX_OUTSIDE = 0.01
 """Part of the pixels whose codes may lie outside of the projector: misread ones."""
@@ -102,7 +102,7 @@ class ImportSettings(Callbacks):
     sequence: Path | str | None = None
     role: Role = "calibration"
     prefix: str | None = None
-    projector: Size | None = None
+    projector: GivenSize | None = None
     channel: Channel | None = None
     origin: str | None = None
     force: bool = False
@@ -186,7 +186,7 @@ def read_captures(
     layout: str = "detect",
     *,
     sequence: Path | str | None = None,
-    projector: Size | None = None,
+    projector: GivenSize | None = None,
     channel: Channel | None = None,
     warn: Warn = ignore_warnings,
     **options: Any,
@@ -217,7 +217,7 @@ def find_captures(
     sequence: Path | str | None = None,
     *,
     prefix: str | None = None,
-    projector: Size | None = None,
+    projector: GivenSize | None = None,
     channel: Channel | None = None,
     session: SessionLike | None = None,
     warn: Warn = ignore_warnings,
@@ -257,7 +257,7 @@ def find_captures(
 
 
 def _suppose_layout(
-    source: Path, projector: Size | None, channel: Channel | None, error: UnknownLayoutError
+    source: Path, projector: GivenSize | None, channel: Channel | None, error: UnknownLayoutError
 ) -> UnknownLayoutError:
     """Return the error that says what the images of an unknown layout show, as far as they suggest
     it; the given error where there are too few of them."""
@@ -334,7 +334,7 @@ def _layout_of_session(store: Session | None, source: Path) -> FolderLayout | No
     }
 
     def describe(
-        folder: Path, name: str, projector: tuple[int, int] | None
+        folder: Path, name: str, projector: Size | None
     ) -> tuple[ImportableRecording, list[str]]:
         """Return the recording of a folder."""
         capture = same[folder]
@@ -348,7 +348,7 @@ def _layout_of_session(store: Session | None, source: Path) -> FolderLayout | No
     return define_layout("frames", holds, describe, same.__contains__) if same else None
 
 
-def _known_projector_size(store: Session | None) -> tuple[int, int] | None:
+def _known_projector_size(store: Session | None) -> Size | None:
     """The projector's size by the session's captures, else by its imported calibration; None where
     both are missing."""
     if store is None:
@@ -446,8 +446,8 @@ def import_opencv_calibration(
     keys: Keys | None = None,
     *,
     unit: Units | None = None,
-    projector: Size | None = None,
-    camera: Size | None = None,
+    projector: GivenSize | None = None,
+    camera: GivenSize | None = None,
     force: bool = False,
     warn: Warn = ignore_warnings,
 ) -> StereoModel | None:
@@ -524,10 +524,10 @@ def identify_calibration_keys(file: Path | str) -> dict[str, str]:
 def _resolve_size(
     path: Path,
     device: str,
-    given: Size | None,
-    stated: dict[str, tuple[tuple[int, int], str]],
+    given: GivenSize | None,
+    stated: dict[str, tuple[Size, str]],
     captured: set[Any],
-) -> tuple[int, int] | None:
+) -> Size | None:
     """The size that is given, else stated in the file, else the captures'; InputError where these
     differ."""
     sources = {f"--{device}": parse_size(given)} if given is not None else {}
@@ -553,7 +553,7 @@ def _resolve_size(
 
 
 def _check_principal_points(
-    matrices: Mapping[str, np.ndarray], sizes: Mapping[str, tuple[int, int] | None], warn: Warn
+    matrices: Mapping[str, np.ndarray], sizes: Mapping[str, Size | None], warn: Warn
 ) -> None:
     """Warn where an optical axis is outside of its image: a shifted lens, or another pixel
     scale."""

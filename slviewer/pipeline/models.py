@@ -12,6 +12,7 @@ from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE, PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError, SessionError, SlviewerError
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.imported_verdict import judge_imported, warning_of_imported
@@ -111,8 +112,8 @@ def save_imported_stereo(
     matrices: Mapping[str, np.ndarray],
     *,
     source: str,
-    camera: tuple[int, int] | None,
-    projector: tuple[int, int] | None,
+    camera: Size | None,
+    projector: Size | None,
     unit: str | None = None,
 ) -> None:
     """Save imported matrices as the session's stereo calibration; sizes that are None follow from

@@ -28,7 +28,7 @@ from slviewer.calibration.observe import (
 from slviewer.errors import BoardError, DamagedError, InputError
 from slviewer.examination.light import Look
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence, Size
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.geometry.vectors import rms
 from slviewer.pipeline.capture_phases import (
@@ -278,13 +278,13 @@ def _decode_observation(
     return None if meta["refused"] else Observation.from_arrays(name, arrays)
 
 
-def _other_size(capture: Capture) -> tuple[int, int]:
+def _other_size(capture: Capture) -> Size:
     """Return the size px of the device beside the camera. Raises InputError where the projector's
     is not known."""
     return capture.other_size or capture.sequence.projector
 
 
-def _wxh(size: tuple[int, int]) -> str:
+def _wxh(size: Size) -> str:
     """Format a size (width, height) px as "WxH"."""
     return f"{size[0]}x{size[1]}"
 

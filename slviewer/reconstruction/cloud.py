@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.rigid import Floats, Floats32, Mask
 from slviewer.records.merge import ProjectorFill
 
@@ -18,9 +18,7 @@ Map = np.ndarray
 """(h, w): a value for each pixel of an organised cloud."""
 
 
-def number_tiles(
-    pixels: np.ndarray, size: tuple[int, int], tiles: tuple[int, ...]
-) -> NDArray[np.intp]:
+def number_tiles(pixels: np.ndarray, size: Size, tiles: tuple[int, ...]) -> NDArray[np.intp]:
     """Return the number (n,) of the tile, of ``tiles`` (rows, columns) of an image of ``size``
     (width, height), that each pixel (n, 2) lies in; of the nearest one outside."""
     place = (pixels[:, ::-1] * tiles / size[::-1]).astype(int)

@@ -11,7 +11,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.vectors import finite_rows, rms_length, shared_rms, subsample
 from slviewer.records.calibration import Reprojection, is_pattern
 from slviewer.records.verification import Verification
@@ -462,9 +462,7 @@ def pose_bars(of: Reprojection, *, width: int = FULL) -> Figure:
     )
 
 
-def residual_arrows(
-    title: str, pixels: np.ndarray, residuals: np.ndarray, size: tuple[int, int]
-) -> Figure:
+def residual_arrows(title: str, pixels: np.ndarray, residuals: np.ndarray, size: Size) -> Figure:
     """Residuals (n, 2) px as arrows at ``pixels`` (n, 2) in an image of ``size`` = (width, height),
     magnified, at most ``MOST_ARROWS``; consecutive ones are neighbours, and the caption says
     whether these agree."""
@@ -515,7 +513,7 @@ def residual_arrows(
     )
 
 
-def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> Figure:
+def coverage(title: str, size: Size, poses: Sequence[np.ndarray]) -> Figure:
     """Figure of the features (n, 2) px of each pose in an image of ``size``, their hulls and
     covered share."""
     import cv2
@@ -554,7 +552,7 @@ def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> 
     )
 
 
-def _new_image_axes(size: tuple[int, int], title: str) -> tuple[Any, Any]:
+def _new_image_axes(size: Size, title: str) -> tuple[Any, Any]:
     """A figure and its axes, framed as an image of ``size``."""
     drawing = new_figure(HALF, 420)
     axes = drawing.subplots()

@@ -13,12 +13,12 @@ import numpy as np
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
 from slviewer.fringe.layout import lowest_white, sample_phase_steps
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import PatternSequence, Size
 from slviewer.records.calibration import SECOND_CAMERA
 from slviewer.records.record import from_plain
 from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.reading import MOST_REMEMBERED, decoding, identify, read_json
-from slviewer.session.results import Exposure, Size, digest_bytes
+from slviewer.session.results import Exposure, StoredSize, digest_bytes
 from slviewer.session.stack import (
     FrameStack,
     check_indices,
@@ -69,7 +69,7 @@ class Capture:
     name: str
     role: Role
     sequence: PatternSequence
-    size: tuple[int, int]  # (width, height) of the camera's frames, px
+    size: Size  # (width, height) of the camera's frames, px
     # of frames, exposures, texture, sequence: equal where every result computed from them is equal
     hash: str
     folder: Path
@@ -166,7 +166,7 @@ class Capture:
         return text.replace("projector", SECOND_CAMERA) if self.is_of_pair else text
 
     @property
-    def other_size(self) -> tuple[int, int] | None:
+    def other_size(self) -> Size | None:
         """(width, height) px of the device that the camera is calibrated with: the second camera,
         else the projector, None where that is not known."""
         return self.sequence.projector_size if self.second is None else self.second.size
@@ -256,7 +256,7 @@ class Capture:
 class _Camera:
     """The entry `camera` of `capture.json`."""
 
-    size: Size
+    size: StoredSize
 
 
 @dataclass(frozen=True)

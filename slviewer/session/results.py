@@ -35,7 +35,7 @@ from slviewer.session.reading import (
 
 T = TypeVar("T")
 Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
-Size = tuple[Extent, Extent]
+StoredSize = tuple[Extent, Extent]
 _Matrix3 = tuple[Vector, Vector, Vector]
 Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
 
@@ -81,8 +81,8 @@ class _Stereo(ResultMeta, total=False):
 
     imported: _Imported
     source: str
-    camera: Size | None
-    projector: Size | None
+    camera: StoredSize | None
+    projector: StoredSize | None
 
 
 class _Verdict(ResultMeta, total=False):
@@ -144,7 +144,7 @@ class _Edits(ResultMeta, total=False):
     """`edits/*`."""
 
     capture: str
-    size: Size
+    size: StoredSize
     applied: Count
     edits: list[_Edit]
     content: str

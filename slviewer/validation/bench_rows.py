@@ -23,7 +23,7 @@ from slviewer.fringe.kernels_coded import coded_rows
 from slviewer.fringe.kernels_levels import levels_rows
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import PatternSequence, Size
 from slviewer.fringe.threshold import fringe_mean
 from slviewer.geometry import cuda_device
 from slviewer.geometry.jit import kernel
@@ -262,7 +262,7 @@ def missing(package: str) -> str:
     return ""
 
 
-def fringes_row(frames: int, size: tuple[int, int], ours: float) -> Row:
+def fringes_row(frames: int, size: Size, ours: float) -> Row:
     """Decoding by `fringes` of as many frames of (width, height), shared among three periods;
     ``ours`` seconds took our kernel. It makes its arrays itself: brightness and modulation of each
     period, and coordinates.

@@ -33,6 +33,7 @@ from slviewer.calibration.next_pose import (
 )
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
 from slviewer.target.board import Board
 from slviewer.wizard.service import LatestWorker, log
@@ -64,8 +65,8 @@ class PlanInput:
     """
 
     board: Board
-    camera: tuple[int, int]
-    projector: tuple[int, int]
+    camera: Size
+    projector: Size
     features: Mapping[str, PoseFeatures]
     stereo: StereoModel | None = None
     focal_px: float | None = None

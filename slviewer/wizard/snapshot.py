@@ -12,6 +12,7 @@ from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.calibration.stereo import StereoModel
 from slviewer.devices.browser import PageRole
 from slviewer.devices.world import Thing
+from slviewer.fringe.sequence import Size
 from slviewer.pipeline.capture import Space
 from slviewer.pipeline.examination import Preflight
 from slviewer.pipeline.operation import Stored
@@ -111,9 +112,9 @@ class RigView:
     state: RigState = "none"
     name: str = ""
     simulated: bool = False
-    camera: tuple[int, int] | None = None
-    projector: tuple[int, int] | None = None
-    second: tuple[int, int] | None = None
+    camera: Size | None = None
+    projector: Size | None = None
+    second: Size | None = None
     exposure_ms: float | None = None
     gain: float | None = None
     light: str = "white"  # what the projector shows between captures

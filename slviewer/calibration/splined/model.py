@@ -36,7 +36,7 @@ from slviewer.calibration.splined.unknowns import (
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
@@ -322,7 +322,7 @@ def calibrate_splined(
 
 
 def calibrate_projector(
-    pair: SplinedModel, observations: Sequence[Observation], size: tuple[int, int]
+    pair: SplinedModel, observations: Sequence[Observation], size: Size
 ) -> SplinedModel:
     """Calibrate the projector of two cameras, whose model is ``pair``, in their frame of reference:
     with the first camera, the board and its poses as they are there.

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats
 from slviewer.session.importers.filestorage import Storage, read_storage
@@ -53,7 +54,7 @@ class CameraFile:
     notes: tuple[str, ...] = ()
 
 
-def read_camera_file(path: Path | str, size: tuple[int, int]) -> CameraFile:
+def read_camera_file(path: Path | str, size: Size) -> CameraFile:
     """The lens in a file, for images of ``size`` (width, height) px.
 
     A lens of another image size with the same aspect ratio is adapted, with a note. Raises
@@ -97,7 +98,7 @@ def read_camera_file(path: Path | str, size: tuple[int, int]) -> CameraFile:
     )
 
 
-def _adapt(lens: Lens, size: tuple[int, int], name: str, notes: list[str]) -> Lens:
+def _adapt(lens: Lens, size: Size, name: str, notes: list[str]) -> Lens:
     """Return the lens for images of another size. Raises InputError for those of another shape."""
     if lens.size == size:
         return lens
@@ -219,7 +220,7 @@ class _Entries:
         notes.append("it states no distortion: taken as none")
         return np.zeros(5)
 
-    def size(self) -> tuple[int, int] | None:
+    def size(self) -> Size | None:
         """Return the image's (width, height) px; None where unstated."""
         pair = next(self._select(SIZES, 2), None)
         if pair is not None:

@@ -76,7 +76,15 @@ from typing import Annotated, Any, get_args
 import msgspec
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import SEQUENCE_KEYS, Axis, Frame, Kind, PatternSequence, parse_size
+from slviewer.fringe.sequence import (
+    SEQUENCE_KEYS,
+    Axis,
+    Frame,
+    Kind,
+    PatternSequence,
+    Size,
+    parse_size,
+)
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
     FolderLayout,
@@ -367,7 +375,7 @@ class Description:
 
 
 def _read(
-    source: Path, toml: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None
+    source: Path, toml: Path, *, prefix: str | None = None, projector: Size | None = None
 ) -> Imports:
     """Captures named after their folders, all described by the one TOML.
 
@@ -404,7 +412,7 @@ def _read(
     return collect_captures(Path(source), prefix, described.is_capture, looks_like, describe)
 
 
-def read_description(toml: Path, projector: tuple[int, int] | None = None) -> Description:
+def read_description(toml: Path, projector: Size | None = None) -> Description:
     """What a TOML describes; `projector` is for one that does not state the size. Raises
     InputError."""
     toml = Path(toml)
@@ -469,7 +477,7 @@ def _split_cameras(
     return left, right
 
 
-def _describe(name: str, data: Mapping[str, Any], projector: tuple[int, int] | None) -> Description:
+def _describe(name: str, data: Mapping[str, Any], projector: Size | None) -> Description:
     """What the entries of one camera in the TOML ``name`` describe."""
     groups = read_groups(name, data)
     try:

@@ -6,7 +6,7 @@ from itertools import groupby
 from pathlib import Path
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import Frame, parse_size
+from slviewer.fringe.sequence import Frame, Size, parse_size
 from slviewer.session.importers.guess import Guess, guess_sequence
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
 from slviewer.session.importers.imported import images_by_name, list_folders
@@ -93,7 +93,7 @@ def _format_toml(
     names: list[str],
     guess: Guess,
     channel: Channel | None,
-    projector: tuple[int, int] | None,
+    projector: Size | None,
     doubts: tuple[str, ...],
 ) -> str:
     """Return the text of the guessed TOML, with comments for its evidence and doubts."""

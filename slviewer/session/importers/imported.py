@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import PatternSequence, Size
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers.images import (
     DEFAULT_CHANNEL,
@@ -127,7 +127,7 @@ class FolderLayout:
     holds: str
     read: Callable[..., Imports]
     is_capture: Callable[[Path], bool]
-    projector: tuple[int, int] | None = None
+    projector: Size | None = None
 
     def recognises(self, folder: Path) -> bool:
         """Whether `is_capture` is true; False where it fails, so that one layout does not hide the
@@ -143,7 +143,7 @@ def define_layout(
     holds: str,
     describe: Callable[..., tuple[ImportableRecording, list[str]]],
     is_capture: Callable[[Path], bool],
-    projector: tuple[int, int] | None = None,
+    projector: Size | None = None,
     needs_projector: str = "",
 ) -> FolderLayout:
     """Return a layout whose captures are recognised by their file names alone.
@@ -158,7 +158,7 @@ def define_layout(
         source: Path,
         *,
         prefix: str | None = None,
-        projector: tuple[int, int] | None = None,
+        projector: Size | None = None,
         **options: Any,
     ) -> Imports:
         """Return the captures of a source; InputError where the projector's size is needed and not

@@ -45,7 +45,7 @@ import numpy as np
 from slviewer.entry_points import IMPORTERS, PluginGroup
 from slviewer.errors import InputError, UnknownLayoutError
 from slviewer.fringe.presets import AXES, gray, gray_bits, phase_steps
-from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis, Size
 from slviewer.session.importers.frames import LAYOUT as FRAMES
 from slviewer.session.importers.images import read_frames, read_image
 from slviewer.session.importers.imported import (
@@ -80,7 +80,7 @@ def _read_graycode(
     source: Path,
     *,
     prefix: str | None = None,
-    projector: tuple[int, int] | None = None,
+    projector: Size | None = None,
     files: str | None = None,
 ) -> Imports:
     """Captures named after their folders. `files` is a pattern of names (* and ? are wildcards) for
@@ -201,7 +201,7 @@ def _define_numbered(
     pattern = re.compile(stem, re.IGNORECASE)
 
     def describe(
-        folder: Path, recording: str, size: tuple[int, int] | None, **options: Any
+        folder: Path, recording: str, size: Size | None, **options: Any
     ) -> tuple[ImportableRecording, list[str]]:
         """Return the recording of one folder, and warnings."""
         images, others = match_images(folder, pattern)
@@ -220,9 +220,7 @@ _AXES: dict[str, Axis] = {"v": "x", "h": "y"}
 _P18_FILE = re.compile(r"p18_f(\d+)", re.IGNORECASE)
 
 
-def _describe_p18(
-    pose: Path, name: str, projector: tuple[int, int]
-) -> tuple[ImportableRecording, list[str]]:
+def _describe_p18(pose: Path, name: str, projector: Size) -> tuple[ImportableRecording, list[str]]:
     """The recording of one folder, with the axes whose folder is there, V before H.
 
     Raises InputError where frames are missing, double or too many, or where the Gray code cannot
@@ -297,18 +295,14 @@ def _is_p18(folder: Path) -> bool:
     )
 
 
-def _order_procam(
-    images: Images, projector: tuple[int, int]
-) -> tuple[PatternSequence, Iterable[Path]]:
+def _order_procam(images: Images, projector: Size) -> tuple[PatternSequence, Iterable[Path]]:
     """Return the sequence, and the files in its order. The projector's size determines the numbers
     of bits and of images."""
     check_complete(images, "graycode_")
     return _fit_sequence(gray(projector), len(images)), images.values()
 
 
-def _order_sltk(
-    images: Images, projector: tuple[int, int] | None
-) -> tuple[PatternSequence, Iterable[Path]]:
+def _order_sltk(images: Images, projector: Size | None) -> tuple[PatternSequence, Iterable[Path]]:
     """Return the sequence, and the files in its order. Raises InputError where a bit or its
     negative is missing or double."""
     ordered = sorted(images, key=lambda numbers: numbers[3])
@@ -337,7 +331,7 @@ _SINGLE_AXIS: tuple[Codec, ...] = ("3", "4")
 
 
 def _order_slstudio(
-    images: Images, projector: tuple[int, int], codec: Codec | None = None, axis: Axis = "x"
+    images: Images, projector: Size, codec: Codec | None = None, axis: Axis = "x"
 ) -> tuple[PatternSequence, Iterable[Path]]:
     """Return the sequence, and the files in its order. Without ``codec`` the number of frames
     determines it, where that is enough; ``axis`` is the one that a codec along a single axis
@@ -376,9 +370,7 @@ def _order_slstudio(
     return sequence, images.values()
 
 
-def _list_frames(
-    codec: Codec, projector: tuple[int, int], axes: tuple[Axis, ...]
-) -> tuple[Frame, ...]:
+def _list_frames(codec: Codec, projector: Size, axes: tuple[Axis, ...]) -> tuple[Frame, ...]:
     """Return the frames of a codec in the order in which SLStudio shows them."""
     frames = [Frame("white"), Frame("black")] if codec == "gray" else []
     for axis in axes:
@@ -390,7 +382,7 @@ def _list_frames(
     return tuple(frames)
 
 
-def _gray_cell(axis: Axis, projector: tuple[int, int]) -> float:
+def _gray_cell(axis: Axis, projector: Size) -> float:
     """Return the width in px of the finest Gray code cell; SLStudio does not show the least
     significant bits."""
     extent = projector[AXES.index(axis)]
