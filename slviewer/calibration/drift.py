@@ -34,7 +34,7 @@ from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, Mask, move_points, rigid_transform
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.splines import basis_matrix, second_differences
+from slviewer.geometry.splines import image_basis, second_differences
 from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
 from slviewer.records.acceptance import Drift
 from slviewer.records.record import to_vector
@@ -131,11 +131,9 @@ class DisplacementField:
 
     def basis(self, pixels: Floats) -> sp.csr_array:
         """Return the spline basis (n, unknowns) at pixels (n, 2): displacement by coefficients."""
-        across, down = (
-            basis_matrix(np.clip(pixels[:, k], -0.5, size - 0.5), -0.5, size - 0.5, cells)
-            for k, (size, cells) in enumerate(zip(self.size, self.cells, strict=True))
-        )
-        return sp.csr_array((down[:, :, None] * across[:, None]).reshape(-1, self.unknowns))
+        size = np.array(self.size)
+        inside = np.clip(pixels, -0.5, size - 0.5)
+        return sp.csr_array(image_basis(inside, size, self.cells))
 
     @cached_property
     def roughness(self) -> sp.csr_array:

@@ -135,6 +135,13 @@ def basis_matrix(positions: np.ndarray, start: float, end: float, cells: int) ->
     return matrix
 
 
+def image_basis(pixels: np.ndarray, size: np.ndarray, cells: tuple[int, int]) -> np.ndarray:
+    """(n, coefficients): weight of each coefficient of a field over an image of ``size`` px at
+    pixels (n, 2); ``cells`` (across, down)."""
+    across, down = (basis_matrix(pixels[:, k], -0.5, size[k] - 0.5, cells[k]) for k in range(2))
+    return (down[:, :, None] * across[:, None]).reshape(len(pixels), -1)
+
+
 def cubic_basis(
     positions: np.ndarray, start: float, end: float, cells: int
 ) -> tuple[np.ndarray, np.ndarray]:

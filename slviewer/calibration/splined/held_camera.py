@@ -9,7 +9,7 @@ from slviewer.calibration.splined.normal import BlockFactor
 from slviewer.calibration.splined.unknowns import LENS, Device, UnknownLayout
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats
-from slviewer.geometry.splines import basis_matrix
+from slviewer.geometry.splines import image_basis
 from slviewer.geometry.vectors import finite_rows
 
 MOST_PIXELS = 4000
@@ -104,10 +104,7 @@ def lens_like_fields(device: Device, lens: Lens, pixels: Floats) -> Floats:
     rays, pixels = rays[seen], pixels[seen]
     points, none = np.column_stack([rays, np.ones(len(rays))]), np.zeros(3)
     by_lens = cv2.projectPoints(points, none, none, lens.K, lens.D)[1][:, 6 : 6 + LENS]
-    width, height = device.size
     rows, columns = device.coefficients.shape[1:]
-    across = basis_matrix(pixels[:, 0], -0.5, width - 0.5, columns - 3)
-    down = basis_matrix(pixels[:, 1], -0.5, height - 0.5, rows - 3)
-    products = (down[:, :, None] * across[:, None, :]).reshape(len(pixels), -1)
+    products = image_basis(pixels, device.size, (columns - 3, rows - 3))
     alike = np.hstack([by_lens[k::2].T @ products for k in range(2)])
     return np.linalg.qr(alike.T)[0].T
