@@ -3,7 +3,6 @@ applied; the region of interest, and the points that were deleted."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,6 +12,7 @@ from slviewer.errors import InputError, UsageError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import AcceptanceTest
 from slviewer.records.record import from_plain
+from slviewer.session.layout import time_now
 from slviewer.session.reading import expand_user, read_toml
 from slviewer.session.scan_edits import load_edits, load_region
 from slviewer.session.store import Session
@@ -93,7 +93,7 @@ def record_scale(store: Session, acceptance: AcceptanceTest) -> float:
         "artefact": acceptance.artefact.name,
         "certificate": acceptance.artefact.certificate,
         "captures": [position.capture for position in acceptance.positions],
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "time": time_now(),
         "inputs": store.input_hashes(f"calibration/{acceptance.model}"),
     }
     store.save_result(f"scale/{acceptance.model}", meta, {})

@@ -4,7 +4,6 @@ on them."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from datetime import UTC, datetime
 
 import msgspec
 import numpy as np
@@ -42,6 +41,7 @@ from slviewer.reconstruction.axis_agreement import REFUSED_PX, check_sizes
 from slviewer.reconstruction.camera_match import epipolar_lines
 from slviewer.records.calibration import TransformCheck
 from slviewer.session.capture import Capture
+from slviewer.session.layout import time_now
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
@@ -121,7 +121,7 @@ def _complete(store: Session, check: TransformCheck) -> TransformCheck:
     """Return a check with its time, and the hashes of what it is of."""
     return msgspec.structs.replace(
         check,
-        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        time=time_now(),
         inputs=store.input_hashes(check.capture, "calibration/stereo"),
     )
 

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
-from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from functools import partial, update_wrapper, wraps
 from pathlib import Path
@@ -25,6 +24,7 @@ from slviewer.pipeline.imported_verdict import warning_of_imported
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import all_kinds
 from slviewer.records.record import Meta, Record, from_plain, render_text, to_plain
+from slviewer.session.layout import time_now
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 
@@ -433,7 +433,7 @@ class Operation(Generic[P, S, R]):
                         "settings": plain_settings(found.settings or settings),
                     }
                     if hasattr(record, "time"):
-                        origin["time"] = datetime.now(UTC).isoformat(timespec="seconds")
+                        origin["time"] = time_now()
                     record = msgspec.structs.replace(record, **origin)
                 if any(each.startswith("calibration/") for each in record.inputs):
                     warning = warning_of_imported(job.store)

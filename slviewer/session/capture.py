@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,6 +16,7 @@ from slviewer.fringe.sequence import PatternSequence, Size
 from slviewer.records.calibration import SECOND_CAMERA
 from slviewer.records.record import from_plain
 from slviewer.session.atomic import to_json, write_bytes
+from slviewer.session.layout import time_now
 from slviewer.session.reading import MOST_REMEMBERED, decoding, identify, read_json
 from slviewer.session.results import Exposure, StoredSize, digest_bytes
 from slviewer.session.stack import (
@@ -386,7 +386,7 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
         to_json(
             {
                 "role": role,
-                "created": datetime.now(UTC).isoformat(timespec="seconds"),
+                "created": time_now(),
                 "source": capture.source,
                 "board": board,
                 "camera": {"size": [frames.shape[2], frames.shape[1]], "dtype": str(frames.dtype)},

@@ -87,9 +87,13 @@ def create_layout(folder: Path) -> None:
     with disk_errors(folder):
         for inner in ("captures", "results"):
             (folder / inner).mkdir(exist_ok=True)
-    created = datetime.now(UTC).isoformat(timespec="seconds")
-    described = {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"}
+    described = {"schema": SCHEMA, "created": time_now(), "program": f"slviewer {__version__}"}
     replace_file(folder / "session.json", to_json(described))
+
+
+def time_now() -> str:
+    """Return the time in UTC, as the files of a session state it."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def raise_schema(folder: Path) -> None:
