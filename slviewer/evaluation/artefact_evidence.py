@@ -11,7 +11,7 @@ import numpy as np
 from slviewer.evaluation.fit import Map, Points, ShapeResult
 from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.shapes import Sphere
-from slviewer.geometry.vectors import unit_vectors
+from slviewer.geometry.vectors import thin_out, unit_vectors
 from slviewer.records.acceptance import SurfaceEvidence
 
 VISIBLE, VISIBLE_ALONE = (np.cos(np.radians(angle)) for angle in (60.0, 45.0))
@@ -65,7 +65,7 @@ def _expect_ball(
     """Return the pixels (h, w) bool where a ball is visible for camera and projector, and how many
     these are with those beyond the image's border."""
     at = np.argwhere(evaluated)[:, ::-1]
-    chosen = at[:: max(1, len(at) // 4000)]
+    chosen = thin_out(at, 4000)
     known = points[chosen[:, 1], chosen[:, 0]].astype(np.float64)
     pixels = chosen.astype(np.float64)
     ray: Floats = known[:, :2] / known[:, 2:]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel, run_rows
+from slviewer.geometry.vectors import thin_out
 
 FloatMap = NDArray[np.float32]
 TILES = (4, 5)
@@ -89,7 +90,7 @@ def estimate_camera_blur(
     blur = np.full(TILES, LEAST_PX, np.float32)
     if np.count_nonzero(mask) < EDGES:
         return blur
-    usual = float(np.median(modulation[mask][:: max(1, np.count_nonzero(mask) // 100_000)]))
+    usual = float(np.median(thin_out(modulation[mask], 100_000)))
     size = 2 * REACH + 1
     least = max(CONTRAST * usual, NOISE_RANGE * noise)
     slopes = [np.zeros_like(modulation), np.zeros_like(modulation)]

@@ -54,10 +54,15 @@ def subsample(values: np.ndarray, most: int) -> np.ndarray:
     return values[:: max(1, -(-len(values) // most))]
 
 
+def thin_out(values: np.ndarray, least: int) -> np.ndarray:
+    """Return every k-th of values (n, ...), with the greatest k that leaves at least so many."""
+    return values[:: max(1, len(values) // least)]
+
+
 def median_spacing(tree: "scipy.spatial.cKDTree", samples: int) -> float:
     """Return the median distance of points of a search tree to their nearest other point, over some
     ``samples`` of them; infinite for a single point."""
-    distance, _ = tree.query(tree.data[:: max(1, tree.n // samples)], k=2)
+    distance, _ = tree.query(thin_out(tree.data, samples), k=2)
     return float(np.median(distance[:, 1]))
 
 
@@ -78,7 +83,7 @@ def occupied_cubes(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndar
     several times faster than three.
     """
     cube = np.floor(points / side).astype(np.int64)
-    middle = np.median(cube[:: max(1, len(cube) // 1000)], axis=0).astype(np.int64)
+    middle = np.median(thin_out(cube, 1000), axis=0).astype(np.int64)
     cube -= middle - (1 << _BITS - 1)
     cube.clip(0, (1 << _BITS) - 1, out=cube)
     shifts = np.array([2 * _BITS, _BITS, 0])

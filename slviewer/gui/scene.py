@@ -16,6 +16,7 @@ import viser
 import viser.transforms as tf
 from numpy.typing import NDArray
 
+from slviewer.geometry.vectors import thin_out
 from slviewer.gui.widgets import Text
 from slviewer.server.viser_internals import listen_to_shapes
 from slviewer.surface.selection import ViewCamera
@@ -549,7 +550,7 @@ def frame_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return camera position and target (3,) mm that show valid points (n, 3) in a view of that
     width over height, whose field of view has a size relative to the perspective one."""
-    low, high = np.percentile(points[:: max(1, len(points) // 20_000)], [2, 98], axis=0)
+    low, high = np.percentile(thin_out(points, 20_000), [2, 98], axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     # the field of view is that of the height
     away = max(1.45 * size * max(1.0, 0.85 / aspect), 50.0)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.io import wavfile
 
 from slviewer.errors import hide_passwords
+from slviewer.geometry.vectors import thin_out
 from slviewer.pipeline.operation import Stored, name_records
 from slviewer.records.record import Column, Mark, Table, relabel
 from slviewer.report.page import Figure
@@ -433,7 +434,7 @@ def colour_range(values: NDArray[np.floating]) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 1.0
-    low, high = np.percentile(finite[:: max(1, finite.size // 300_000)], [1, 99])
+    low, high = np.percentile(thin_out(finite, 300_000), [1, 99])
     return float(low), float(high)
 
 

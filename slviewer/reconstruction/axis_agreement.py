@@ -20,7 +20,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, Floats32
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.triangulation import triangulate_pixels
-from slviewer.geometry.vectors import lengths
+from slviewer.geometry.vectors import lengths, subsample
 from slviewer.reconstruction.cloud import Misfit, number_tiles
 from slviewer.reconstruction.rig_change import bound_change, differentiate
 
@@ -389,8 +389,7 @@ def compute_agreement(
 
 def _sample_pixels(mask: np.ndarray) -> np.ndarray:
     """Return rows and columns (2, n) of at most `SAMPLE` pixels of a mask (h, w)."""
-    places = np.array(np.nonzero(mask))
-    return places[:, :: max(1, -(-places.shape[1] // SAMPLE))]
+    return subsample(np.argwhere(mask), SAMPLE).T
 
 
 def sample_axes(phases: Mapping[Axis, PhaseMap]) -> tuple[Floats, Floats, Floats]:

@@ -10,6 +10,7 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.triangulation import check_map, points_from_depth
+from slviewer.geometry.vectors import thin_out
 
 SAMPLE = 4000
 """Pixels for which the largest unique depth range is computed; neighbours differ little."""
@@ -94,7 +95,7 @@ def _unique_far(
     rig: StereoRig, rays: Floats, near: float, far: float, axis: str, reach: float
 ) -> float:
     """Return the depth in mm up to which the phase is unique from ``near`` on."""
-    rays = rays[:: max(1, len(rays) // SAMPLE)]
+    rays = thin_out(rays, SAMPLE)
     least, most = near, far
     for _ in range(30):
         middle = 0.5 * (least + most)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats
-from slviewer.geometry.vectors import lengths, median_spacing
+from slviewer.geometry.vectors import lengths, median_spacing, thin_out
 from slviewer.registration.open3d_loader import open3d, point_cloud
 
 LEAST_POINTS = 500
@@ -182,7 +182,7 @@ def scale_of(size: float) -> float:
 def measure_size(points: np.ndarray) -> float:
     """Return the longest side in mm of the points' bounding box between their 1st and 99th
     percentiles."""
-    low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
+    low, high = np.percentile(thin_out(points, 100_000), (1.0, 99.0), axis=0)
     return float((high - low).max())
 
 

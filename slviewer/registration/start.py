@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, fit_rigid, move_points, rigid_transform, turn_about
-from slviewer.geometry.vectors import diagonal, lengths, unit_vectors
+from slviewer.geometry.vectors import diagonal, lengths, thin_out, unit_vectors
 from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import PreparedScan
@@ -91,7 +91,7 @@ def search_starts(
 def pose_distance(points: Floats, T: Floats, other: Floats) -> float:
     """Return the largest coordinate difference in mm of some 20 of the points (n, 3) between two
     poses (4, 4)."""
-    return float(np.abs(move_points(T - other, points[:: max(1, len(points) // 20)])).max())
+    return float(np.abs(move_points(T - other, thin_out(points, 20))).max())
 
 
 def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: Floats, voxel: float) -> float:
@@ -145,7 +145,7 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
     rest = motions[order[votes[order] >= max(4.0, _LEAST_VOTES * votes.max())]]
     while len(rest) and len(poses) < _CANDIDATES:
         poses.append(rest[0])
-        gaps = move_points(rest - rest[0], p[:: max(1, len(p) // 20)])
+        gaps = move_points(rest - rest[0], thin_out(p, 20))
         rest = rest[np.abs(gaps).max(axis=(1, 2)) > 5.0 * voxel]
     return poses
 

@@ -12,7 +12,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis, Size
-from slviewer.geometry.vectors import finite_rows, rms_length, shared_rms, subsample
+from slviewer.geometry.vectors import finite_rows, rms_length, shared_rms, subsample, thin_out
 from slviewer.records.calibration import Reprojection, is_pattern
 from slviewer.records.verification import Verification
 from slviewer.report.page import (
@@ -149,7 +149,7 @@ def verification_maps(
 def error_limit(maps: list[np.ndarray]) -> float:
     """Upper limit, mm, of a symmetric colour scale for all of ``maps``: 99 % of the absolute errors
     are below it."""
-    samples = [m.ravel()[:: max(1, m.size // 300_000)] for m in maps]
+    samples = [thin_out(m.ravel(), 300_000) for m in maps]
     return round_up(percentile(np.abs(np.concatenate(samples)), 99))
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slviewer.geometry.vectors import subsample, thin_out
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.records.measurement import NominalDeviation
 from slviewer.report.page import (
@@ -191,9 +192,8 @@ def draw_photo(name: str, texture: np.ndarray, points: np.ndarray) -> Figure:
 def draw_surface(words: str, points: np.ndarray, normals: np.ndarray | None) -> Figure:
     """A surface of ``points`` (n, 3) mm in clay, seen from above and aside; ``normals`` (n, 3) NaN
     or None where unknown; ``words``: what it is of."""
-    step = max(1, -(-len(points) // MOST_POINTS))
-    shown = points[::step]
-    facing = np.full_like(shown, np.nan) if normals is None else normals[::step]
+    shown = subsample(points, MOST_POINTS)
+    facing = np.full_like(shown, np.nan) if normals is None else subsample(normals, MOST_POINTS)
     clay = np.broadcast_to(CLAY, shown.shape)
     image = render_points(shown, facing, clay, PICTURE, view_rotation(YAW_DEG, PITCH_DEG))
     words = f"{words}, {_format_count(points)}"
@@ -207,9 +207,10 @@ def draw_merged_cloud(fused: Fused) -> Figure:
 
     surface = fused.surface
     assert surface.normals is not None
-    step = max(1, -(-len(surface.points) // MOST_POINTS))
-    points, normals = surface.points[::step], surface.normals[::step]
-    source, count = fused.source[::step].astype(np.intp), _format_count(surface.points)
+    points, normals, source = (
+        subsample(each, MOST_POINTS) for each in (surface.points, surface.normals, fused.source)
+    )
+    source, count = source.astype(np.intp), _format_count(surface.points)
     size = (2 * HALF - 40, 2 * HALF - 240)
     rotation = view_rotation(YAW_DEG, PITCH_DEG)
     drawing = new_figure(FULL, HALF - 40)
@@ -303,7 +304,7 @@ def section_plot(
     axes = drawing.subplots()
     style_axes(axes, name if cursors is None else "", "along, mm", "height, mm")
     for line in lines:
-        axes.plot(*line[:: max(1, len(line) // MOST_DRAWN)].T, color=LINE, linewidth=1.3)
+        axes.plot(*thin_out(line, MOST_DRAWN).T, color=LINE, linewidth=1.3)
     for (letter, cursor), colour in zip((cursors or {}).items(), CURSOR_COLOURS, strict=False):
         axes.axvline(cursor[0], color=colour, linewidth=0.9, linestyle=":")
         axes.plot(*cursor, "o", color=colour, markersize=5)

@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from slviewer.errors import InputError, SessionError
-from slviewer.geometry.vectors import diagonal, lengths
+from slviewer.geometry.vectors import diagonal, lengths, thin_out
 from slviewer.session import cad
 from slviewer.session.polygons import Polygons, read_polygons, to_polygons, triangulate_polygons
 from slviewer.session.reading import expand_user, read_input
@@ -95,7 +95,7 @@ def check_size(nominal: Nominal, points: np.ndarray) -> None:
     """
     if nominal.units is not None:
         return
-    some = points[:: max(1, len(points) // 100_000)]
+    some = thin_out(points, 100_000)
     scan = diagonal(np.percentile(some, [1, 99], axis=0))
     model = float(np.linalg.norm(nominal.size_mm))
     ratio = scan / model

@@ -16,6 +16,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.fit import Comparison
+from slviewer.geometry.vectors import thin_out
 from slviewer.inputs import SEED
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
@@ -365,7 +366,6 @@ def _list_records(comparisons: Mapping[str, Comparison]) -> dict[str, Verificati
 def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
     """Points (n, 3) mm of the stereo model's plane on the rays of the evaluated pixels."""
     result = comparison.results["stereo"]
-    v, u = np.nonzero(result.inliers)
-    chosen = np.arange(0, len(u), max(1, len(u) // 5000))
-    d = np.column_stack([rays[v[chosen], u[chosen]], np.ones(len(chosen))])
+    v, u = thin_out(np.argwhere(result.inliers), 5000).T
+    d = np.column_stack([rays[v, u], np.ones(len(u))])
     return d * (result.plane.offset / (d @ result.plane.normal))[:, None]

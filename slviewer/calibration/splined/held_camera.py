@@ -10,7 +10,7 @@ from slviewer.calibration.splined.unknowns import LENS, Device, UnknownLayout
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.splines import image_basis
-from slviewer.geometry.vectors import finite_rows
+from slviewer.geometry.vectors import finite_rows, thin_out
 
 MOST_PIXELS = 4000
 EXACT = np.array([1e-3] * 4 + [1e-6] * 5)
@@ -98,7 +98,7 @@ def lens_like_fields(device: Device, lens: Lens, pixels: Floats) -> Floats:
 
     A field without them changes neither focal length nor principal point nor Brown's distortion.
     """
-    pixels = pixels[:: max(1, len(pixels) // MOST_PIXELS)]
+    pixels = thin_out(pixels, MOST_PIXELS)
     rays = lens.undistort(pixels)
     seen = finite_rows(rays)
     rays, pixels = rays[seen], pixels[seen]
