@@ -222,17 +222,19 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
 
 
 @numba.njit(inline="always")
+def allocate_three(width):
+    """Allocate three rows of float32, see `allocate_five`."""
+    return np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+
+
+@numba.njit(inline="always")
 def shift_row(stack, shift, row, wrapped, modulation, background, peak):
     """Compute wrapped phase, modulation, background and largest sample of one image row, (w,) each.
 
     ``peak`` is of the frames' dtype, the others are float32.
     """
     width, first = stack.shape[2], stack[shift.first, row]
-    cosine, sine, total = (
-        np.empty(width, np.float32),
-        np.empty(width, np.float32),
-        np.empty(width, np.float32),
-    )
+    cosine, sine, total = allocate_three(width)
     sums_row(stack, shift, row, cosine, sine, total, peak)
     per_two, per_one, counted = (
         np.float32(2 / shift.steps),
@@ -294,7 +296,7 @@ def bit_height(stack, frames, inverses, bit, row, x, threshold):
 def allocate_five(width):
     """Allocate five rows of float32; separate arrays, so that the compiler knows that none
     overlap."""
-    a, b, c = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    a, b, c = allocate_three(width)
     return a, b, c, np.empty(width, np.float32), np.empty(width, np.float32)
 
 

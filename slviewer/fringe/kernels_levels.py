@@ -13,6 +13,7 @@ from slviewer.fringe.kernels import (
     TURN_REST,
     ZERO,
     allocate_five,
+    allocate_three,
     arctan2,
     is_dark_squared,
     select_period,
@@ -169,7 +170,7 @@ def levels_row(
 def allocate_levels(width):
     """Allocate the buffers of a row: whether clipped, and eight of float32."""
     a, b, c, d, e = allocate_five(width)
-    f, g, h = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    f, g, h = allocate_three(width)
     return np.empty(width, np.bool_), a, b, c, d, e, f, g, h
 
 
