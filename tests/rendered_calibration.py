@@ -1,6 +1,8 @@
-"""A simulated rig calibrated in memory from rendered target poses, as the proofs share it."""
+"""A simulated rig calibrated in memory from rendered target poses, as the proofs share it, or in
+a session by its true lenses."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.observe import Observation
@@ -9,11 +11,19 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.phase import PhaseMap
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.operation import Progress, track
-from slviewer.pipeline.simulate import TARGET
+from slviewer.pipeline.simulate import TARGET, save_true_stereo
+from slviewer.session.store import Session
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 from slviewer.validation.bench_scaling import observe_rendered, scan_sequence
+
+
+def true_calibration(folder: Path, rig: SimulatedRig) -> None:
+    """Make a session whose stereo calibration is that of a simulated rig's true lenses, local
+    distortion apart."""
+    with Session.create(folder) as store:
+        save_true_stereo(store, rig)
 
 
 def calibrate_rendered(

@@ -26,7 +26,7 @@ from slviewer.pipeline.operation import Progress, ignore_progress
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.server.secure import SafeServer, Serving
 from slviewer.session.store import Session
-from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.rig import letter
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import LiveView, Snapshot
 
@@ -98,7 +98,8 @@ def live_rate(scale: float, seconds: float, progress: Progress = ignore_progress
     progress(0.0, "preparing the rig")
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
-        true_calibration(session, letter(scale))
+        with Session.create(session) as store:
+            save_true_stereo(store, letter(scale))
         with (
             Operator(session, {"driver": "simulated", "scale": scale}) as operator,
             contextlib.closing(App(operator, Serving(port=0))) as app,
@@ -221,13 +222,6 @@ def _connect(server: SafeServer) -> ClientConnection:
         max_size=2**26,
         ping_interval=None,  # who stalls does not give up by itself
     )
-
-
-def true_calibration(folder: Path, rig: SimulatedRig) -> None:
-    """Make a session whose stereo calibration is that of a simulated rig's true lenses, local
-    distortion apart."""
-    with Session.create(folder) as store:
-        save_true_stereo(store, rig)
 
 
 def _wait_for(operator: Operator, condition: Callable[[Snapshot], bool]) -> None:

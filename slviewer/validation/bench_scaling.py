@@ -24,7 +24,7 @@ from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.operations.batch import batch
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.operation import Progress, track
-from slviewer.pipeline.simulate import TARGET
+from slviewer.pipeline.simulate import TARGET, save_true_stereo
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Starts, register_all
 from slviewer.session.store import Session
@@ -35,7 +35,6 @@ from slviewer.simulation.scenes import Scene
 from slviewer.simulation.turning import STEPS, turning
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
-from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import Row, median, row, run_python
 from slviewer.wizard.pose_plan import Planner
 from slviewer.wizard.session_reader import SessionReader
@@ -214,10 +213,10 @@ def _time_whole_captures(scene: Any) -> list[Row]:
 def save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
     """Make a session with the rig's true calibration and so many equal scans."""
     rig = letter(scale)
-    true_calibration(session, rig)
     sequence = scan_sequence(rig)
     frames = Renderer(rig, scene).capture(sequence)
-    with Session.open(session, write=True) as store:
+    with Session.create(session) as store:
+        save_true_stereo(store, rig)
         for number in range(1, count + 1):
             store.save_capture(f"scan_{number:02d}", "scan", sequence, frames, source="simulated")
 

@@ -37,9 +37,9 @@ from slviewer.session.inspection_plan import OWN_PLAN, read_plan, write_plan
 from slviewer.session.scan_edits import load_edits
 from slviewer.simulation.rig import letter
 from slviewer.simulation.turning import turn_pose, turning
-from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
+from tests.rendered_calibration import true_calibration
 
 pytestmark = [pytest.mark.computes, pytest.mark.slow]
 

@@ -13,8 +13,9 @@ from slviewer.gui.app import App
 from slviewer.gui.scene import thin
 from slviewer.server.secure import Serving
 from slviewer.simulation.rig import letter
-from slviewer.validation.bench_live import live_rate, true_calibration
+from slviewer.validation.bench_live import live_rate
 from slviewer.wizard.operator import Operator
+from tests.rendered_calibration import true_calibration
 
 SCALE = 0.15
 

@@ -20,7 +20,7 @@ from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.rig import letter
-from slviewer.validation.bench_live import true_calibration
+from tests.rendered_calibration import true_calibration
 
 
 @pytest.mark.process  # which Open3D starts while it is imported

@@ -24,7 +24,7 @@ from slviewer.session.scan_edits import load_edits, load_region
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.surface.selection import EditHistory
-from slviewer.validation.bench_live import true_calibration
+from tests.rendered_calibration import true_calibration
 
 pytestmark = pytest.mark.computes
 

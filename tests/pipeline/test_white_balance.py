@@ -17,7 +17,7 @@ from slviewer.pipeline.mesh import balance, measure_white, mesh
 from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.validation.bench_live import true_calibration
+from tests.rendered_calibration import true_calibration
 
 pytestmark = pytest.mark.computes
 

@@ -21,7 +21,7 @@ from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.server.device_pages import serve_device_pages
 from slviewer.server.secure import SafeServer, Serving, serve
 from slviewer.simulation.rig import letter
-from slviewer.validation.bench_live import true_calibration
+from tests.rendered_calibration import true_calibration
 
 SCALE = 0.25
 SIZE = (400, 300)

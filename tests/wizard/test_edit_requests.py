@@ -18,10 +18,10 @@ from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.simulation.rig import letter
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import SupportPlane
-from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import whole_cloud
 from slviewer.wizard.snapshot import SessionView
+from tests.rendered_calibration import true_calibration
 
 pytestmark = pytest.mark.computes
 
