@@ -23,7 +23,7 @@ import numpy as np
 
 from slviewer.calibration.local_fit import fit_local_values
 from slviewer.errors import DetectionError, InputError
-from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.phase import PhaseMap, PhaseMaps
 from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
 from slviewer.geometry.rigid import Floats, Mask
@@ -184,7 +184,7 @@ class Samples:
 
 
 def block_samples(
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     bright: Mapping[Axis, Mask],
     count: int = COUNT,
 ) -> Samples:
@@ -353,7 +353,7 @@ def observe(
     name: str,
     board: Board,
     detection: Detection,
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     smoothing: Smoothing | None = None,
 ) -> Observation:
     """Compute the observation of one pose from its detected board and its decoded phase maps by
@@ -416,7 +416,7 @@ def pitch_px(board: Board, detection: Detection) -> Floats:
 
 def _projector_pixels(
     detection: Detection,
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     bright: Mapping[Axis, Mask],
     pitch: Floats,
 ) -> tuple[Floats, Floats]:

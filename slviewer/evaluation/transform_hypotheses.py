@@ -15,8 +15,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.fit import evaluate_spheres, finite_or_none
-from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.phase import PhaseMap, PhaseMaps
 from slviewer.geometry.rig import LARGEST_BASELINE_MM, StereoRig
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.triangulation import points_from_depth, triangulate
@@ -82,7 +81,7 @@ class Fit:
 Fits = Mapping[Direction, Fit]
 
 
-def check_by_axes(name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]) -> TransformCheck:
+def check_by_axes(name: str, rig: StereoRig, phases: PhaseMaps) -> TransformCheck:
     """Check R and T by a capture with both axes: the misfit is the distance from the epipolar
     lines, px. Raises InputError where too few pixels are decoded."""
     pixels, measured, sigma = sample_axes(phases)
@@ -158,9 +157,7 @@ def check_by_sphere(name: str, rig: StereoRig, phase: PhaseMap, radius_mm: float
     return msgspec.structs.replace(_make_check(name, "sphere", fits), unit="mm")
 
 
-def check_by_single_axis(
-    name: str, rig: StereoRig, phases: Mapping[Axis, PhaseMap]
-) -> TransformCheck:
+def check_by_single_axis(name: str, rig: StereoRig, phases: PhaseMaps) -> TransformCheck:
     """Check R and T by a capture with one axis, which contradicts them where points lie behind a
     device or outside of the projector's field, and confirms nothing."""
     depths, share = measure_single_axis(phases, rig)

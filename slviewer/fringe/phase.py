@@ -76,7 +76,7 @@ class PhaseMap:
     model_error_rad: float = 0.0
     sigma_scale: float = 1.0
     sigma_known: np.ndarray | None = None
-    light: Mapping[Axis, PhaseMap] | None = None
+    light: PhaseMaps | None = None
 
     def __post_init__(self) -> None:
         """Raise InputError unless all maps have the same shape (h, w)."""
@@ -179,3 +179,7 @@ class PhaseMap:
         return replace(self, phase=corrected), moved.remaining * np.float32(
             self.period_px / (2 * np.pi)
         )
+
+
+PhaseMaps = Mapping[Axis, PhaseMap]
+"""The phase maps of a capture, of one axis or both."""

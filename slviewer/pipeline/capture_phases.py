@@ -17,10 +17,10 @@ from slviewer.fringe.decode import decode, texture
 from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import axis_layout, to_eight_bits, white_level
-from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
 from slviewer.fringe.phase_shifting import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.examination import (
     MUCH_CLIPPED,
     examine_frames,
@@ -74,7 +74,7 @@ _FAULTS = {
 
 def decode_capture(
     capture: Capture, look: Look | None = None, *, relative: bool = False
-) -> dict[Axis, PhaseMap]:
+) -> PhaseMaps:
     """Decode the absolute phase of every axis of a capture, by a ``look`` at its frames, taken here
     if None.
 
@@ -97,10 +97,10 @@ def decode_capture(
 
 def match_second(
     capture: Capture,
-    phases: dict[Axis, PhaseMap],
+    phases: PhaseMaps,
     lines: Callable[[np.ndarray], Lines] | None = None,
     warn: Warn = ignore_warnings,
-) -> dict[Axis, PhaseMap]:
+) -> PhaseMaps:
     """Return what a capture is reconstructed from: its decoded ``phases``, or, where two cameras
     saw it, the coordinates of the second one, as `match_cameras` does.
 
@@ -131,7 +131,7 @@ def _calibrated_lines(session: Session, _: np.ndarray) -> Lines:
 
 def decode_frames(
     name: str, sequence: PatternSequence, frames: np.ndarray, light: FrameLight | None = None
-) -> dict[Axis, PhaseMap]:
+) -> PhaseMaps:
     """Decode the phase of every axis, absolute or not, under equal light; errors name the capture.
 
     ``light`` of the frames is estimated if None.
@@ -145,7 +145,7 @@ def decode_frames(
 
 def decode_or_explain(
     name: str, sequence: PatternSequence, look: Look, files: Sequence[str] = ()
-) -> dict[Axis, PhaseMap]:
+) -> PhaseMaps:
     """Decode as `decode_frames` does; where that fails, raise InputError with what the examination
     of the frames rejects, if it does."""
     try:
@@ -157,7 +157,7 @@ def decode_or_explain(
 
 def decode_examined(
     name: str, sequence: PatternSequence, frames: np.ndarray, files: Sequence[str] = ()
-) -> dict[Axis, PhaseMap]:
+) -> PhaseMaps:
     """Examine the frames (n, h, w), decode them, and check what was decoded.
 
     Raises InputError like `check_capture`, and for frames that cannot be decoded; what the
@@ -184,7 +184,7 @@ def check_capture(
     name: str,
     sequence: PatternSequence,
     frames: np.ndarray,
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     examination: Examination | None = None,
     files: Sequence[str] = (),
 ) -> None:
@@ -230,9 +230,7 @@ def check_capture(
         )
 
 
-def loss_warnings(
-    sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
-) -> list[str]:
+def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: PhaseMaps) -> list[str]:
     """Return warnings where saturation or weak fringes mask many pixels of a decoded capture (n, h,
     w)."""
     messages = []
@@ -273,7 +271,7 @@ def least_modulation(sequence: PatternSequence, frames: np.ndarray, phase: Phase
     return float(dark_limit(background, phase.noise, white, sigmas)[0])
 
 
-def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:
+def scatter_warnings(phases: PhaseMaps) -> list[str]:
     """Return warnings where neighbouring pixels scatter more than the camera's noise explains: by
     how much, and what to do."""
     worst = max(phases.values(), key=lambda phase: phase.sigma_scale, default=None)
@@ -324,7 +322,7 @@ def decode_captures(
     relative: bool = False,
     check: bool = True,
     matched: bool = True,
-) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
+) -> Iterator[tuple[Capture, np.ndarray, PhaseMaps]]:
     """Captures with their frames and phases, in order; the next one's frames are read while one is
     processed.
 
@@ -410,7 +408,7 @@ class DecodedFiles:
     """A decoded capture and the files that it was written to, by what they hold."""
 
     capture: str
-    phases: Mapping[Axis, PhaseMap]
+    phases: PhaseMaps
     folder: Path
     files: Mapping[str, str]
 

@@ -14,8 +14,8 @@ from slviewer.examination.examine import examine
 from slviewer.examination.light import Look
 from slviewer.fringe.cosines import select_rows
 from slviewer.fringe.layout import white_level
-from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.phase import PhaseMaps, Reason
+from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.operation import Warn
 from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Examination
@@ -136,7 +136,7 @@ _BRIGHTER = "Raise the exposure, or open the aperture."
 
 
 def check_capture_exposure(
-    sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
+    sequence: PatternSequence, frames: np.ndarray, phases: PhaseMaps
 ) -> Check:
     """Whether the frames (n, h, w) of a capture are too bright or too dark, by the pixels that see
     the patterns."""
@@ -173,7 +173,7 @@ def warn_of_exposure(
     name: str,
     sequence: PatternSequence,
     frames: np.ndarray,
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     warn: Warn,
 ) -> None:
     """Warn, with the capture's name, where `check_capture_exposure` finds it too bright or too

@@ -2,7 +2,7 @@
 board, or a sphere of known size. The session stores them, and the verdict on the calibration rests
 on them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 
 import msgspec
@@ -17,8 +17,7 @@ from slviewer.evaluation.transform_hypotheses import (
     check_by_single_axis,
     check_by_sphere,
 )
-from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.phase import PhaseMaps
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import move_points
 from slviewer.geometry.vectors import lengths
@@ -161,7 +160,7 @@ def check_imported(job: Job, name: str, target: str, radius_mm: float | None) ->
 
 
 def _check_on_board(
-    name: str, rig: StereoRig, notation: str, texture: np.ndarray, phases: Mapping[Axis, PhaseMap]
+    name: str, rig: StereoRig, notation: str, texture: np.ndarray, phases: PhaseMaps
 ) -> TransformCheck:
     """Check R and T by the board of this notation in a capture."""
     board = Board.parse(notation)

@@ -27,7 +27,7 @@ from slviewer.calibration.observe import (
 )
 from slviewer.errors import BoardError, DamagedError, InputError
 from slviewer.examination.light import Look
-from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.phase import PhaseMaps
 from slviewer.fringe.sequence import Axis, PatternSequence, Size
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.geometry.vectors import rms
@@ -67,10 +67,10 @@ class DecodedPose:
     name: str
     sequence: PatternSequence
     look: Look
-    phases: Mapping[Axis, PhaseMap]
+    phases: PhaseMaps
     texture: np.ndarray
     board: Board
-    matched: Mapping[Axis, PhaseMap] | None = None
+    matched: PhaseMaps | None = None
     fault: str = ""
 
 

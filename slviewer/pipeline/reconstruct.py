@@ -13,7 +13,7 @@ import numpy as np
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import DetectionError, InputError, UsageError
 from slviewer.evaluation.fit import Comparison, fit_clouds
-from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
 from slviewer.fringe.sequence import Axis
 from slviewer.inputs import RADIUS
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
@@ -285,7 +285,7 @@ class ComparedCapture:
 
     capture: Capture
     frames: np.ndarray
-    phases: Mapping[Axis, PhaseMap]
+    phases: PhaseMaps
     found: Comparison
     masked: Mapping[str, float]
 
@@ -378,7 +378,7 @@ def capture_cloud(
     job: Job,
     model: Model,
     capture: Capture,
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     axis: Axis | None = None,
     *,
     extrapolates: bool = False,
@@ -430,10 +430,10 @@ def capture_cloud(
 def absolute_phases(
     store: Session,
     name: str,
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     depth_range: tuple[float, float] | None = None,
     warn: Warn = ignore_warnings,
-) -> dict[Axis, PhaseMap]:
+) -> PhaseMaps:
     """Return a capture's phases, ambiguous ones made absolute by the depth range (near, far) mm of
     the scene; by default the calibrated one. An axis that more than one depth fits is solved by the
     other axis, with a warning.

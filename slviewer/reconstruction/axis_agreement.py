@@ -13,8 +13,8 @@ from typing import Literal, Protocol
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis, Size
+from slviewer.fringe.phase import PhaseMaps
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, Floats32
@@ -188,7 +188,7 @@ def check_sizes(name: str, camera: Size, projector: Size | None, calibrated: Ste
 
 def check_phases(
     name: str,
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     calibration: Calibration,
     depth_range: tuple[float, float] | None = None,
     accept: bool = False,
@@ -392,7 +392,7 @@ def _sample_pixels(mask: np.ndarray) -> np.ndarray:
     return subsample(np.argwhere(mask), SAMPLE).T
 
 
-def sample_axes(phases: Mapping[Axis, PhaseMap]) -> tuple[Floats, Floats, Floats]:
+def sample_axes(phases: PhaseMaps) -> tuple[Floats, Floats, Floats]:
     """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their
     errors (n, 2) px by noise and by blur at edges."""
     v, u = _sample_pixels(np.logical_and.reduce([phase.mask for phase in phases.values()]))
@@ -402,7 +402,7 @@ def sample_axes(phases: Mapping[Axis, PhaseMap]) -> tuple[Floats, Floats, Floats
     return np.column_stack([u, v]).astype(float), measured, np.column_stack(errors).astype(float)
 
 
-def measure_single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[Floats, float]:
+def measure_single_axis(phases: PhaseMaps, rig: StereoRig) -> tuple[Floats, float]:
     """Depths (n,) mm of one axis' points, and the share of the decoded pixels that have one."""
     ((axis, phase),) = phases.items()
     v, u = _sample_pixels(phase.mask)
@@ -415,7 +415,7 @@ def measure_single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tupl
     return points[known, 2], float(known.mean())
 
 
-def possible_directions(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> str:
+def possible_directions(phases: PhaseMaps, rig: StereoRig) -> str:
     """Return in words what R and T may be instead: the directions that put the points of one axis
     before both devices and into the projector's field; empty without any."""
     directions = list_directions(rig)

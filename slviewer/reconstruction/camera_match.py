@@ -12,14 +12,14 @@ calibrated pair has; on a board that both see, the board's own coordinate.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rig import StereoRig
@@ -70,10 +70,10 @@ class Lines:
 
 
 def match_cameras(
-    first: Mapping[Axis, PhaseMap],
-    second: Mapping[Axis, PhaseMap],
+    first: PhaseMaps,
+    second: PhaseMaps,
     lines: Lines | None = None,
-) -> dict[Axis, PhaseMap]:
+) -> PhaseMaps:
     """Return, by axis, the pixel coordinates of the second camera that see what the pixels of the
     first see, as phase maps (h, w) of the first: along x its columns, along y its rows.
 

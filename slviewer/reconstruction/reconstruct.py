@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.phase import PhaseMap, PhaseMaps
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.vectors import finite_rows
@@ -66,7 +66,7 @@ class KnowsSupport(Protocol):
 
 def reconstruct_cloud(
     model: Model,
-    phases: Mapping[Axis, PhaseMap],
+    phases: PhaseMaps,
     axis: Axis | None = None,
     texture: np.ndarray | None = None,
     *,
@@ -186,7 +186,7 @@ def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
     return max(axes, key=lambda axis: int(valid[axis].sum()))
 
 
-def _join_axes(axes: Mapping[Axis, PhaseMap] | tuple[Axis, ...]) -> str:
+def _join_axes(axes: PhaseMaps | tuple[Axis, ...]) -> str:
     """Format axis names as text: "x and y"."""
     return " and ".join(sorted(axes)) or "none"
 

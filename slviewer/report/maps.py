@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.sequence import Axis, Size
+from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.vectors import finite_rows, rms_length, shared_rms, subsample, thin_out
 from slviewer.records.calibration import Reprojection, is_pattern
 from slviewer.records.verification import Verification
@@ -252,7 +252,7 @@ def reason_shares(phase: PhaseMap) -> dict[Reason, float]:
     return {why: share for why, share in shares.items() if share or why != Reason.UNSEEN}
 
 
-def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
+def phase_maps(title: str, phases: PhaseMaps) -> Figure:
     """The coordinates of each axis side by side; masked pixels in the colour of their reason, with
     their shares."""
     from matplotlib.colors import ListedColormap
