@@ -8,10 +8,11 @@ depart in one place are not strays: inside a ball, or behind a plate, they belon
 import cv2
 import numpy as np
 
-from slviewer.evaluation.fit import Map, Points, ShapeResult
+from slviewer.evaluation.fit import ShapeResult
 from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.shapes import Sphere
 from slviewer.geometry.vectors import thin_out, unit_vectors
+from slviewer.reconstruction.cloud import Map, Points
 from slviewer.records.acceptance import SurfaceEvidence
 
 VISIBLE, VISIBLE_ALONE = (np.cos(np.radians(angle)) for angle in (60.0, 45.0))

@@ -30,7 +30,7 @@ from slviewer.geometry.shapes import (
 )
 from slviewer.geometry.vectors import finite_rows, patch_means, rms, subsample, unit_vectors
 from slviewer.reconstruction.axis_agreement import RAISED_RATIO
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, Map, Points
 from slviewer.records.record import to_vector
 from slviewer.records.verification import MAX_EXCLUDED, ModelFit, Shape, Verification
 
@@ -42,11 +42,6 @@ SPHERE_TOLERANCE = 0.04  # of its radius, if that is less
 RIM_PX = 2  # mixed pixels at an object's outline show neither the object nor what is behind it
 LEAST_PIXELS = 200
 _SAMPLE = 40_000
-
-Points = np.ndarray
-"""Of an organised cloud (h, w, 3), or some of its points (n, 3), mm."""
-Map = np.ndarray
-"""(h, w): a value for each pixel of an organised cloud."""
 
 
 @dataclass(frozen=True, eq=False)

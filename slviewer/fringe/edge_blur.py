@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel, run_rows
+from slviewer.geometry.rigid import Floats32, Mask
 from slviewer.geometry.vectors import thin_out
 
-FloatMap = NDArray[np.float32]
 TILES = (4, 5)
 """Rows and columns of tiles in which the blur is estimated: it may vary over the image."""
 REACH = 8
@@ -65,11 +65,11 @@ class EdgeDisplacement:
     be subtracted there.
     """
 
-    shift: FloatMap
-    is_continuous: NDArray[np.bool_]
+    shift: Floats32
+    is_continuous: Mask
 
     @property
-    def remaining(self) -> FloatMap:
+    def remaining(self) -> Floats32:
         """(h, w) float32: error of a phase from which the shift was subtracted where the surface is
         continuous."""
         return np.abs(self.shift) * np.where(
@@ -77,9 +77,7 @@ class EdgeDisplacement:
         )
 
 
-def estimate_camera_blur(
-    modulation: FloatMap, mask: NDArray[np.bool_], noise: float = 0.0
-) -> FloatMap:
+def estimate_camera_blur(modulation: Floats32, mask: Mask, noise: float = 0.0) -> Floats32:
     """Estimate the standard deviation, px, of the camera's point spread: (rows, columns) of `TILES`
     float32.
 
@@ -123,7 +121,7 @@ def estimate_camera_blur(
 
 
 def estimate_displacement(
-    phase: FloatMap, modulation: FloatMap, noise: float = 0.0
+    phase: Floats32, modulation: Floats32, noise: float = 0.0
 ) -> EdgeDisplacement:
     """Estimate the displacement of the ``phase`` (h, w) rad by the camera's blur.
 
@@ -155,13 +153,13 @@ def estimate_displacement(
 
 
 def _confirm(
-    phase: FloatMap,
-    modulation: FloatMap,
+    phase: Floats32,
+    modulation: Floats32,
     displaced: EdgeDisplacement,
     level: NDArray[np.uint8],
     blur: float,
     noise: float,
-) -> FloatMap:
+) -> Floats32:
     """Return the factor (LEVELS,) by which displacements become those of the phase from a straight
     line.
 
@@ -198,7 +196,7 @@ def _confirm(
     return factors if is_confirmed else np.zeros(LEVELS, np.float32)
 
 
-def _compute_weighted_median(values: FloatMap, weights: FloatMap) -> float:
+def _compute_weighted_median(values: Floats32, weights: Floats32) -> float:
     """Return the median of values of these weights, all above 0."""
     return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
 

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
-from slviewer.geometry.rigid import move_points, rotation_angle
+from slviewer.geometry.rigid import Floats32, move_points, rotation_angle
 from slviewer.pipeline.cloud_corrections import (
     describe_calibration,
     resolve_region,
@@ -451,9 +451,9 @@ class AlignedScans:
     where unknown. ``names``: the scans, in the order in which they were captured."""
 
     names: tuple[str, ...]
-    points: NDArray[np.float32]
+    points: Floats32
     seen_by: NDArray[np.uint8]
-    normals: NDArray[np.float32]
+    normals: Floats32
 
     @property
     def share_seen_again(self) -> float:

@@ -18,6 +18,7 @@ from slviewer.fringe.limits import DARK_LEVELS
 from slviewer.fringe.phase_shifting import dark_sigmas, phase_shift
 from slviewer.fringe.plateau import find_plateau
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.geometry.rigid import Floats, Floats32, Mask
 from slviewer.pipeline.operation import Progress, ignore_progress
 
 MAX_SUGGESTED = 4
@@ -25,10 +26,7 @@ BUDGET_S = 20.0
 """What a capture may last by default."""
 Region = tuple[int, int, int, int]
 Exposures = tuple[float, ...]
-Values = NDArray[np.float64]
-Levels = NDArray[np.float32]
 Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 STATES = ("unlit", "measured", "saturated", "dark")
 """States of a pixel, by their numbers in `ExposureSuggestion.state`."""
 _UNLIT, _MEASURED, _SATURATED, _DARK = range(len(STATES))
@@ -96,10 +94,10 @@ class _Look:
     brightest sample; ``repeat`` (2, h, w): the same frame twice."""
 
     exposure_ms: float
-    modulation: Levels
-    background: Levels
-    peak: Levels
-    repeat: Levels
+    modulation: Floats32
+    background: Floats32
+    peak: Floats32
+    repeat: Floats32
 
 
 def suggest_exposure(
@@ -289,7 +287,7 @@ class _Bracket:
         """The longest exposure that a capture has time for."""
         return 1e3 * self.budget_s / self._frames - self._overhead_ms
 
-    def _examine(self, current_ms: Sequence[float | None]) -> tuple[Values, Values, Mask]:
+    def _examine(self, current_ms: Sequence[float | None]) -> tuple[Floats, Floats, Mask]:
         """Look at the present exposures, at shorter ones until nothing is saturated, and at longer
         ones until all is or time allows for no more.
 
@@ -348,11 +346,11 @@ class _Bracket:
             slope, offset = np.polyfit(level, spread, 1)
         return max(float(offset), 1 / 12), max(float(slope), 0.0)
 
-    def _duration_ms(self, exposures_ms: Values) -> Values:
+    def _duration_ms(self, exposures_ms: Floats) -> Floats:
         """How long captures in these exposures (..., n) last."""
         return self._frames * np.sum(exposures_ms + self._overhead_ms, axis=-1)
 
-    def _choose(self, low: Values, high: Values) -> Exposures:
+    def _choose(self, low: Floats, high: Floats) -> Exposures:
         """The exposures for pixels with limits (n,) ms; none where the time does not even allow for
         one."""
         first, most = max(min(self._looks), float(np.quantile(high, 0.001))), self._longest_ms()
@@ -390,7 +388,7 @@ class _Bracket:
         state[~lit] = _UNLIT
         return state
 
-    def _required_factor(self, look: _Look, variance: tuple[float, float]) -> Values:
+    def _required_factor(self, look: _Look, variance: tuple[float, float]) -> Floats:
         """Factor (h, w) of the exposure at which a pixel's modulation exceeds the dark limit, in
         grey levels and in standard deviations of a grey level, whose ``variance`` is an offset and
         a slope."""
@@ -418,7 +416,7 @@ def _select_steps(layout: Layout) -> tuple[tuple[int, ...], bool]:
     return (layout.white, layout.black), False
 
 
-def _tabulate_values(grid: Values, low: Values, high: Values) -> Values:
+def _tabulate_values(grid: Floats, low: Floats, high: Floats) -> Floats:
     """Value (n, n + 1) of the pixels that exposure i of the grid measures where exposure j, the
     next one, saturates them; j = n: none follows. A pixel's value is 1, less where it is weakly
     modulated."""
