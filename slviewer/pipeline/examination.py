@@ -2,7 +2,7 @@
 whether they are too bright or too dark; and the results of the checks of a rig or of a capture."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 

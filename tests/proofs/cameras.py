@@ -12,9 +12,9 @@ import numpy as np
 from slviewer.calibration.observe import Observation, observe
 from slviewer.calibration.splined.model import SplinedModel, calibrate_projector
 from slviewer.fringe.decode import texture
-from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
 from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.shapes import fit_plane
 from slviewer.geometry.vectors import rms
 from slviewer.pipeline.capture_phases import decode_frames
@@ -145,7 +145,7 @@ def measure_fill(pair: SplinedModel, projector: SplinedModel, phase: PhaseMap) -
 
 def scan_both(
     rig: SimulatedRig, scene: Scene, sequence: PatternSequence, number: int
-) -> tuple[np.ndarray, tuple[dict[Axis, PhaseMap], dict[Axis, PhaseMap]]]:
+) -> tuple[np.ndarray, tuple[PhaseMaps, PhaseMaps]]:
     """Return the first camera's frames (n, h, w), and the phases that both decode; the second one
     follows from the rig's seed, wherever its projector is."""
     first = Renderer(rig, scene).capture(sequence, number)
