@@ -181,9 +181,6 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
     and ``peak`` (w,) of the frames' dtype.
     """
     width, lines = stack.shape[2], len(shift.cosines)
-    for x in range(width):
-        total[x] = cosine[x] = sine[x] = ZERO
-        peak[x] = 0
     # two lines to a pass: the sums are read and written less often
     for k in range(0, lines - 1, 2):
         i, j = shift.frames[k], shift.frames[k + 1]
@@ -198,22 +195,34 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
         for q in range(4):
             prefetch_row(stack, i[q], row)
             prefetch_row(stack, j[q], row)
-        for x in range(width):
-            all_x, cos_x, sin_x, peak_x = add_eight(
-                a[x], b[x], c[x], d[x], e[x], f[x], g[x], h[x], cos_a, sin_a, cos_e, sin_e
-            )
-            total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
-            peak[x] = max(peak[x], peak_x)
+        if k == 0:
+            for x in range(width):
+                total[x], cosine[x], sine[x], peak[x] = add_eight(
+                    a[x], b[x], c[x], d[x], e[x], f[x], g[x], h[x], cos_a, sin_a, cos_e, sin_e
+                )
+        else:
+            for x in range(width):
+                all_x, cos_x, sin_x, peak_x = add_eight(
+                    a[x], b[x], c[x], d[x], e[x], f[x], g[x], h[x], cos_a, sin_a, cos_e, sin_e
+                )
+                total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
+                peak[x] = max(peak[x], peak_x)
     if lines % 2:
         k = lines - 1
         i, cos_a, sin_a = shift.frames[k], shift.cosines[k], shift.sines[k]
         a, b, c, d = stack[i[0], row], stack[i[1], row], stack[i[2], row], stack[i[3], row]
         for q in range(4):
             prefetch_row(stack, i[q], row)
-        for x in range(width):
-            all_x, cos_x, sin_x, peak_x = add_four(a[x], b[x], c[x], d[x], cos_a, sin_a)
-            total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
-            peak[x] = max(peak[x], peak_x)
+        if k == 0:
+            for x in range(width):
+                total[x], cosine[x], sine[x], peak[x] = add_four(
+                    a[x], b[x], c[x], d[x], cos_a, sin_a
+                )
+        else:
+            for x in range(width):
+                all_x, cos_x, sin_x, peak_x = add_four(a[x], b[x], c[x], d[x], cos_a, sin_a)
+                total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
+                peak[x] = max(peak[x], peak_x)
     if shift.turn_sine != 0.0 or shift.turn_cosine < 0.0:
         turn, across = np.float32(shift.turn_cosine), np.float32(shift.turn_sine)
         for x in range(width):
