@@ -4,7 +4,9 @@ Every error states what happened and what to do; both are shown to the operator 
 """
 
 import re
-from typing import Self
+from typing import Any, Self, TypeVar
+
+AnyError = TypeVar("AnyError", bound=Exception)
 
 # up to the last @, as passwords hold all kinds of characters
 _CREDENTIALS = re.compile(r"(?<=://)[^\s\"']+(?=@)")
@@ -27,15 +29,20 @@ class SlviewerError(Exception):
     """
 
     exit_status = 1
+    observation = remedy = place = ""
 
     def __init__(self, observation: str = "", remedy: str = "", place: str = "") -> None:
-        super().__init__(observation, remedy, place)
+        super().__init__(observation)
         # plugins may pass what is no text
         parts = map(str, (observation, remedy, place))
         self.observation, self.remedy, self.place = map(hide_passwords, parts)
 
     def __str__(self) -> str:
-        return ": ".join(filter(None, (self.place, self.observation, self.remedy)))
+        stated = ": ".join(filter(None, (self.place, self.observation, self.remedy)))
+        return stated or hide_passwords(super().__str__())  # of a constructor that calls no other
+
+    def __reduce__(self) -> Any:
+        return _make_again, (type(self), self.args, vars(self))
 
     @property
     def located_observation(self) -> str:
@@ -44,10 +51,17 @@ class SlviewerError(Exception):
 
     def within(self, place: str) -> Self:
         """Return a copy of the error with a ``place`` in front of its own."""
-        error = type(self).__new__(type(self), *self.args)  # whatever its constructor takes
         place = ": ".join(filter(None, (hide_passwords(place), self.place)))
-        vars(error).update(vars(self), place=place)
-        return error
+        return _make_again(type(self), self.args, vars(self) | {"place": place})
+
+
+def _make_again(
+    kind: type[AnyError], arguments: tuple[Any, ...], state: dict[str, Any]
+) -> AnyError:
+    """Return an error without a call of its constructor, whatever that takes."""
+    error = kind.__new__(kind, *arguments)
+    vars(error).update(state)
+    return error
 
 
 class UsageError(SlviewerError):

@@ -1,11 +1,12 @@
 """Errors state what happened and what to do, and hold no passwords."""
 
+import copy
 import pickle
 
 import pytest
 
-from slviewer.errors import BoardError, DeviceError, InputError, hide_passwords
-from slviewer.registration.refusal import Refused
+from slviewer.errors import BoardError, DeviceError, InputError, SlviewerError, hide_passwords
+from slviewer.registration.refusal import Refused, WrongPart
 
 
 @pytest.mark.parametrize(
@@ -54,6 +55,29 @@ def test_an_error_survives_another_process() -> None:
     error = BoardError("mirrored", "turn it", "a", cause="axis-reversed").within("b")
     error = pickle.loads(pickle.dumps(error)).within("c")
     assert str(error) == "c: b: a: mirrored: turn it" and error.cause == "axis-reversed"
+
+
+class Jammed(DeviceError):
+    """An error of a plugin, whose constructor takes what it likes and calls no other."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+
+
+class Gone(DeviceError):
+    """Another, which passes its text on."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"{name} is gone", "plug it in")
+
+
+def test_errors_of_plugins_are_shown_copied_and_sent() -> None:
+    for error, text in ((Jammed(7), "7"), (Gone("x"), "x is gone: plug it in")):
+        for each in (error, copy.copy(error), pickle.loads(pickle.dumps(error))):
+            assert type(each) is type(error) and str(each) == text
+    assert copy.copy(Jammed(7)).code == 7 and str(SlviewerError()) == ""
+    wrong = pickle.loads(pickle.dumps(WrongPart("another part").within("scan")))
+    assert str(wrong) == "scan: another part"
 
 
 def test_an_error_with_arguments_of_its_own_is_put_in_a_place() -> None:

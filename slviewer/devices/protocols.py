@@ -382,8 +382,8 @@ def report_driver_faults(device: Camera | Projector | Turntable) -> Iterator[Non
         raise
     except Exception as error:  # a driver's own fault, as of a plugin
         raise DeviceError(
-            f"the driver of {device.name} failed with {type(error).__name__}: {error}; report it to"
-            " the driver's maker"
+            f"the driver of {device.name} failed with {type(error).__name__}: {error}",
+            "report it to the driver's maker",
         ) from error
 
 

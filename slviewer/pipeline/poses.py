@@ -114,7 +114,7 @@ def read_pose(
             observed(observation)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
-        if isinstance(error, BoardError):
+        if isinstance(error, BoardError) and error.cause:
             cause = cast(Cause, error.cause)
             misfit = Finding(cause, "rejected", error.observation, error.remedy)
     examine_them = examined or partial(examine_frames, sequence, frames, look=pose.look)

@@ -90,7 +90,7 @@ def _check_frames(capture: Capture, progress: Progress) -> Preflight:
         phases = decode_frames("", sequence, frames, look.light)
         check_capture("", sequence, frames, phases, examination)
     except InputError as error:
-        refusal = error
+        refusal = error.with_traceback(None)  # which holds the frames
     checks = [
         _check_description(examination, refusal),
         judge_order(sequence, examination),

@@ -72,7 +72,7 @@ def calibrate_with_diagnosis(
     try:
         stereo, used = calibrate_centres(fit, projector, str(board), excluded_before, camera=camera)
     except CalibrationRejected as error:
-        refusal = error
+        refusal = error.with_traceback(None)
         stereo, used = _solve_unchecked(fit, projector, board, excluded_before, camera)
     evidence = Evidence(
         board=str(board),
