@@ -33,12 +33,12 @@ class SlviewerError(Exception):
 
     def __init__(self, observation: str = "", remedy: str = "", place: str = "") -> None:
         super().__init__(observation)
-        # plugins may pass what is no text
+        # plugins may pass other things than text
         parts = map(str, (observation, remedy, place))
         self.observation, self.remedy, self.place = map(hide_passwords, parts)
 
     def __str__(self) -> str:
-        stated = ": ".join(filter(None, (self.place, self.observation, self.remedy)))
+        stated = _join(self.located_observation, self.remedy)
         return stated or hide_passwords(super().__str__())  # of a constructor that calls no other
 
     def __reduce__(self) -> Any:
@@ -47,12 +47,17 @@ class SlviewerError(Exception):
     @property
     def located_observation(self) -> str:
         """The observation, after its place where it has one."""
-        return ": ".join(filter(None, (self.place, self.observation)))
+        return _join(self.place, self.observation)
 
     def within(self, place: str) -> Self:
         """Return a copy of the error with a ``place`` in front of its own."""
-        place = ": ".join(filter(None, (hide_passwords(place), self.place)))
+        place = _join(hide_passwords(place), self.place)
         return _make_again(type(self), self.args, vars(self) | {"place": place})
+
+
+def _join(*parts: str) -> str:
+    """Return the parts of a message that are not empty, as one."""
+    return ": ".join(filter(None, parts))
 
 
 def _make_again(

@@ -243,8 +243,8 @@ def _complete(
     ``applied_ms``: the exposures that were set, none for a single one.
     """
     settings, texture, lens = CameraSettings(), None, dict[str, float]()
-    with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):
-        settings = rig.camera.settings()
+    with contextlib.suppress(DeviceError):
+        settings = read_settings(rig.camera)
     with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):
         texture = capture_colour(rig)
     with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):

@@ -182,7 +182,7 @@ def inspect_surfaces(
             )
         except Cancelled:
             raise
-        except SlviewerError as error:  # one that cannot be measured is no reason to fail it
+        except SlviewerError as error:  # what cannot be measured does not fail
             decision: Decision = "fail" if isinstance(error, WrongPart) else "undecided"
             results = tuple(
                 CharacteristicResult(each.name, None, None, decision, str(error))
