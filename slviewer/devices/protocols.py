@@ -366,10 +366,12 @@ class Rig:
             opened.pop_all()
 
     def close(self) -> None:
-        """Close all devices; never raises."""
-        for camera in self.cameras:
-            camera.close()
-        self.projector.close()
+        """Close all devices; never raises, whatever a plugin's driver does: what was captured is
+        still to be saved."""
+        devices: tuple[Camera | Projector, ...] = (*self.cameras, self.projector)
+        for device in devices:
+            with suppress(SlviewerError), report_driver_faults(device):
+                device.close()
 
 
 @contextmanager

@@ -187,16 +187,16 @@ def capture(settings: CaptureSettings) -> Capture:
                 exposures = exposures if len(exposures) > 1 else []
             capturing = part(progress, begin, 0.95, name)
             captured = capture_sequence(devices, sequence, exposures, capturing)
-        for wanted_ms, applied_ms in zip(exposures, captured.exposures_ms, strict=True):
-            for note in list_changed_settings(
-                devices.camera, CameraSettings(wanted_ms), CameraSettings(applied_ms)
-            ):
-                warn(note)
         progress(0.95, "saving")
         is_pose = settings.role == "calibration"
         purpose: Purpose = "pose" if is_pose else "scan"
         board = target if is_pose else None
         saved = save_frames(store, name, purpose, captured, board=board, force=settings.force)
+        for wanted_ms, applied_ms in zip(exposures, captured.exposures_ms, strict=True):
+            for note in list_changed_settings(
+                devices.camera, CameraSettings(wanted_ms), CameraSettings(applied_ms)
+            ):
+                warn(note)
         try:
             for message in load_or_save_examination(store, saved).warnings():
                 warn(f"{name}: {message}")

@@ -130,6 +130,20 @@ def test_what_fails_after_the_last_frame_loses_none(call: str, fault: Exception)
             assert taken.settings.exposure_ms and taken.texture is None
 
 
+def test_a_device_that_fails_to_close_takes_no_frames_with_it():
+    one, closed = coloured(rig()), []
+
+    def fail() -> None:
+        raise RuntimeError("the cable is out")
+
+    close = one.projector.close
+    one.camera.close = fail
+    one.projector.close = lambda: (closed.append(True), close())
+    with one.opened() as devices:
+        taken = capture_with_texture(devices, SEQUENCE)
+    assert closed == [True] and len(taken.frames) == N
+
+
 class _Page:
     """A projector page that says at once that it has done what it was asked."""
 
