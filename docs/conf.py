@@ -110,8 +110,9 @@ TOPICS: dict[str, tuple[str, str]] = {
     "python-sessions": (
         "Sessions",
         "Session import_captures import_cloud calibrate reconstruct verify align merge mesh measure"
-        " compare run_plan check accept capture batch report export simulate load_calibration"
-        " load_arrays CalibrationResult Measurement Quantity Verification",
+        " compare show_on_part run_plan check accept capture batch report export simulate"
+        " import_poses hand_eye relate_rigs load_calibration load_arrays CalibrationResult"
+        " Measurement Quantity Verification",
     ),
     "python-patterns": (
         "Patterns and decoding",
@@ -126,7 +127,7 @@ TOPICS: dict[str, tuple[str, str]] = {
     "python-clouds": (
         "Clouds and meshes",
         "Cloud reconstruct_cloud align_clouds fuse_clouds mesh_cloud MeshingPlan show read_ply"
-        " write_ply",
+        " write_ply projection_image",
     ),
     "python-simulation": (
         "Simulated and own devices",

@@ -8,15 +8,26 @@ import os
 import sys
 from pathlib import Path
 
+import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.decode import decode
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import p18
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.inspection.deviation import deviation_colours
 from slviewer.operations.plan_rig import plan_rig
+from slviewer.operations.show_on_part import projection_image, write_text
+from slviewer.reconstruction.reconstruct import triangulate_grid
+from slviewer.simulation.plans import objects
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.truth import rig_record
 
 RIGS = {
     "webcam, pocket projector": ("webcam-1080p", "pocket-720p"),
@@ -141,6 +152,102 @@ def draw_noise(path: Path) -> None:
     figure.savefig(path, dpi=100)
 
 
+def draw_mountings(path: Path) -> None:
+    """Draw what a hand-eye calibration measures and solves, for both mountings."""
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.2), layout="constrained")
+    parts = {
+        "eye in hand": ("camera", "board", (2.0, 1.0)),
+        "eye to hand": ("board", "camera", (2.0, 1.0)),
+    }
+    for axis, (title, (on_flange, fixed, flange)) in zip(axes, parts.items(), strict=True):
+        places = {"base": (0.0, 0.0), "flange": flange, on_flange: (3.4, 1.0), fixed: (3.4, -0.4)}
+        arms = [(0, 0), (0.3, 1.4), (1.4, 1.7), flange]
+        axis.plot(*np.transpose(arms), "o-", lw=6, ms=11, color="#c3c7cc", zorder=0)
+        in_hand = on_flange == "camera"
+        arrows = (
+            ("base", "flange", "robot", "#1f9673"),
+            ("camera", "board", "measured", "#1f9673"),
+            ("flange" if in_hand else "base", "camera", "X, solved", "#d9692b"),
+            ("base" if in_hand else "flange", "board", "Z, solved", "#d9692b"),
+        )
+        for start, end, label, colour in arrows:
+            (x0, y0), (x1, y1) = places[start], places[end]
+            style = {"arrowstyle": "->", "color": colour, "lw": 1.8}
+            axis.annotate("", (x1, y1), (x0, y0), arrowprops=style)
+            middle = (x0 + x1) / 2, (y0 + y1) / 2
+            box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
+            axis.text(*middle, label, color=colour, fontsize=9, ha="center", va="center", bbox=box)
+        for name, (x, y) in places.items():
+            axis.plot(x, y, "s" if name in ("camera", "board") else "o", ms=9, color="#333333")
+            axis.text(x + 0.06, y + 0.18, name, fontsize=10, weight="bold")
+        axis.set(title=title, xlim=(-0.4, 4.3), ylim=(-0.8, 2.1), aspect="equal")
+        axis.axis("off")
+    figure.savefig(path, dpi=100)
+
+
+def draw_rigs(path: Path) -> None:
+    """Draw two rigs round one sphere from above: what each sees, and what relates them."""
+    figure, axis = plt.subplots(figsize=(6.4, 3.0), layout="constrained")
+    angles = np.radians(np.linspace(-78, 78, 60))
+    axis.add_patch(plt.Circle((0, 0), 1, color="#e6e8ea"))
+    for name, turn_deg, colour in (
+        ("reference", 180.0, "#2270b8"),
+        ("other rig", -20.0, "#d9692b"),
+    ):
+        turn = np.radians(turn_deg)
+        axis.plot(np.cos(turn + angles), np.sin(turn + angles), lw=4, color=colour, alpha=0.7)
+        x, y = 3.2 * np.cos(turn), 3.2 * np.sin(turn)
+        axis.plot(x, y, "s", ms=13, color=colour)
+        axis.text(x, y - 0.55, name, ha="center", color=colour, fontsize=10, weight="bold")
+        for edge in (-72, 72):
+            rim = np.radians(edge) + turn
+            axis.plot([x, np.cos(rim)], [y, np.sin(rim)], ":", lw=1, color=colour)
+    arrow = {"arrowstyle": "->", "color": "#333333", "lw": 1.6,
+             "connectionstyle": "arc3,rad=-0.55"}  # fmt: skip
+    end = 3.2 * np.cos(np.radians(20)), -3.2 * np.sin(np.radians(20)) + 0.2
+    axis.annotate("", end, (-3.2, 0.25), arrowprops=arrow)
+    axis.text(0, 1.85, "T_reference_rig, with U", ha="center", fontsize=10)
+    axis.text(0, 0, "board, spheres\nor part", ha="center", va="center", fontsize=9)
+    axis.set(xlim=(-4.2, 4.2), ylim=(-1.9, 2.2), aspect="equal")
+    axis.axis("off")
+    figure.savefig(path, dpi=100)
+
+
+def draw_on_part(path: Path) -> None:
+    """Draw what the simulated camera sees of a relief on which its projector shows deviations that
+    are made up: a bump and a dent."""
+    rig = letter(0.5, 3, local_distortion_px=0)
+    renderer = Renderer(rig, objects()["object_r2"])
+    truth = renderer.truth()
+    points = np.where(truth.mask[..., None], truth.points, np.nan)
+    vertices = points[np.isfinite(points).all(axis=2)]
+    x, y, _ = (vertices - np.median(vertices, axis=0)).T
+    deviations = 0.4 * np.exp(-((x - 25) ** 2 + (y + 15) ** 2) / 300)
+    deviations -= 0.5 * np.exp(-((x + 25) ** 2 + (y - 20) ** 2) / 400)
+    record = rig_record(rig)
+    lenses = [
+        Lens(np.array(record[device]["K"]), np.array(record[device]["D"]), each.size)
+        for device, each in (("camera", rig.camera), ("projector", rig.projector))
+    ]
+    model = StereoModel.from_rig(StereoRig(*lenses, rig.R, rig.t))
+    image = projection_image(
+        model,
+        vertices,
+        triangulate_grid(points),
+        deviations[:, None],
+        lambda values: deviation_colours(values[:, 0], 0.4),
+        gamma=rig.light.gamma,
+    )
+    for at in (deviations.argmax(), deviations.argmin()):
+        write_text(image, model.pinholes, vertices[at], f"{deviations[at]:+.2f}")
+    light = ((image / 255) ** rig.light.gamma).astype(np.float32)
+    u, v = (truth.projector[..., k].astype(np.float32) for k in (0, 1))
+    white = renderer.light((None, np.full(rig.projector.size[0], 255)))[..., None]
+    seen = (0.12 + cv2.remap(light, u, v, cv2.INTER_LINEAR)) * white / 255
+    seen = np.where(truth.mask[..., None], seen, 0.0)[80:500, 180:660]
+    plt.imsave(path, np.clip(seen, 0, 1) ** (1 / 2.2))
+
+
 def draw_diagrams(folder: Path) -> None:
     """Draw all diagrams as PNG files."""
     os.environ.setdefault("MPLBACKEND", "agg")
@@ -148,6 +255,9 @@ def draw_diagrams(folder: Path) -> None:
     draw_geometry(folder / "geometry.png")
     draw_phase(folder / "phase.png")
     draw_noise(folder / "noise.png")
+    draw_mountings(folder / "mountings.png")
+    draw_rigs(folder / "rigs.png")
+    draw_on_part(folder / "on_part.png")
 
 
 if __name__ == "__main__":

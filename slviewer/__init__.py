@@ -30,10 +30,6 @@ depth ranges       R1 in front of the calibrated depths, R2 inside, R3 behind
 
 "The Letter" is Vargas, Romero, Zhang and Marrugo, *Pixel-wise rational model for a structured light
 system*, Optics Letters 2023; symbols follow it, and docstrings cite its equation or step.
-
-Data flows one way: geometry, fringe, target, calibration, reconstruction, registration, surface,
-evaluation, inspection, simulation, devices, session, report, pipeline, preflight, wizard, server,
-gui, validation, and the command line at the end. A package imports only from those before it.
 """
 
 import ast

@@ -17,6 +17,9 @@ if typing.TYPE_CHECKING:  # low in the order in which mypy resolves modules that
     from slviewer.fringe.sequence import Frame, PatternSequence, one_axis
     from slviewer.gui.viewer import show
     from slviewer.operations.batch import batch
+    from slviewer.operations.hand_eye import hand_eye
+    from slviewer.operations.relate_rigs import relate_rigs
+    from slviewer.operations.show_on_part import projection_image, show_on_part
     from slviewer.pipeline import datasets
     from slviewer.pipeline.accept import accept, check
     from slviewer.pipeline.calibrate import (
@@ -31,6 +34,7 @@ if typing.TYPE_CHECKING:  # low in the order in which mypy resolves modules that
     from slviewer.pipeline.import_captures import import_captures, read_captures
     from slviewer.pipeline.import_cloud import import_cloud
     from slviewer.pipeline.inspect_parts import run_plan
+    from slviewer.pipeline.machine_poses import import_poses
     from slviewer.pipeline.measure import measure
     from slviewer.pipeline.merge import align, merge
     from slviewer.pipeline.mesh import mesh
@@ -57,14 +61,15 @@ if typing.TYPE_CHECKING:  # low in the order in which mypy resolves modules that
 
 __version__: str
 __all__ = [
-    "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "MeshingPlan",
-    "PatternSequence", "PhaseMap", "Pose", "Quantity", "Reason", "Session", "SimulatedWorld",
-    "SlviewerError", "Verification", "accept", "align", "align_clouds", "batch", "calibrate",
-    "calibrate_frames", "capture", "capture_frames", "check", "compare", "complementary",
-    "datasets", "decode", "detect_board", "draw_error_maps", "evaluate_plane",
-    "evaluate_sphere", "examine", "export", "fuse_clouds", "gray", "import_captures",
-    "import_cloud", "letter_rig", "load_arrays", "load_calibration", "measure", "merge", "mesh",
-    "mesh_cloud", "micro", "multifrequency", "one_axis", "p18", "plugins", "read_captures",
-    "read_ply", "reconstruct", "reconstruct_cloud", "report", "run_plan", "save_calibration",
-    "show", "simulate", "simulated_rig", "texture", "verify", "write_ply",
+    "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "MeshingPlan", "PatternSequence",
+    "PhaseMap", "Pose", "Quantity", "Reason", "Session", "SimulatedWorld", "SlviewerError",
+    "Verification", "accept", "align", "align_clouds", "batch", "calibrate", "calibrate_frames",
+    "capture", "capture_frames", "check", "compare", "complementary", "datasets", "decode",
+    "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere", "examine", "export",
+    "fuse_clouds", "gray", "hand_eye", "import_captures", "import_cloud", "import_poses",
+    "letter_rig", "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud",
+    "micro", "multifrequency", "one_axis", "p18", "plugins", "projection_image", "read_captures",
+    "read_ply", "reconstruct", "reconstruct_cloud", "relate_rigs", "report", "run_plan",
+    "save_calibration", "show", "show_on_part", "simulate", "simulated_rig", "texture", "verify",
+    "write_ply",
 ]  # fmt: skip

@@ -14,8 +14,6 @@ from functools import partial
 from textwrap import fill
 from typing import Any
 
-import tyro
-
 # Several threads multiply small matrices; OpenBLAS would wake threads of its own for each, which
 # then wait for work.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
@@ -26,7 +24,9 @@ from slviewer.commands.command import (
     Arguments,
     Function,
     call,
+    parse_command,
     read_command,
+    read_description,
     read_operation,
     show_result,
     take_options,
@@ -38,7 +38,7 @@ from slviewer.commands.runs import (
     run_preflight,
     run_reproduce,
     run_turn,
-    wizard,
+    run_wizard,
 )
 from slviewer.entry_points import OPERATIONS, find_sources
 from slviewer.errors import Cancelled, SlviewerError, UsageError
@@ -68,12 +68,6 @@ def _run_meshing(function: Function, arguments: Arguments) -> None:
     show_result(function, arguments)
 
 
-CONFIG = (
-    tyro.conf.OmitArgPrefixes,
-    tyro.conf.OmitSubcommandPrefixes,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.PositionalMetavarFromFieldName,
-)
 DESCRIPTION = """usage: slviewer COMMAND ...
 
 Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge.
@@ -92,7 +86,9 @@ def _define_command(source: str, *positional: str, **options: Any) -> Callable[[
 
 
 COMMANDS: dict[str, Callable[[], Function]] = {
-    "wizard": lambda: wizard,
+    "wizard": _define_command(
+        "commands.runs:wizard", "session", options=("commands.runs:Address",), run=run_wizard
+    ),
     "devices": _define_command("pipeline.rig_choice:devices"),
     "plugins": _define_command("plugins:plugins"),
     "preflight": _define_command(
@@ -208,11 +204,26 @@ def list_commands() -> str:
     lines = [DESCRIPTION]
     for name, make in find_commands().items():
         try:
-            text = " ".join((make().__doc__ or "").split("\n\n")[0].split())
+            text = " ".join(_describe(make).split("\n\n")[0].split())
         except UsageError as error:
             text = str(error)
         lines.append(fill(f"  {name:{INDENT - 2}}{text}", WIDTH, subsequent_indent=" " * INDENT))
     return "\n".join(lines)
+
+
+def _describe(make: Callable[[], Function]) -> str:
+    """Return the description of a command; that of a function of slviewer needs no arguments."""
+    if isinstance(make, partial) and make.func is read_command:
+        return read_description(make.args[0])
+    return make().__doc__ or ""
+
+
+def _split_merge(name: str, arguments: list[str]) -> list[str]:
+    """Return the arguments with `export SESSION merge/1` as `export SESSION merge 1`."""
+    match name, arguments:
+        case "export", [session, merge, *others] if merge.startswith("merge/"):
+            return [session, *merge.split("/"), *others]
+    return arguments
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -226,7 +237,7 @@ def main(arguments: list[str] | None = None) -> int:
         if name in ("--version", "-h", "--help"):
             print(f"slviewer {__version__}" if name == "--version" else list_commands())
             return 0
-        tyro.cli(make_command(name), prog=f"slviewer {name}", args=rest, config=CONFIG)()
+        parse_command(make_command(name), name, _split_merge(name, rest))()
     except SystemExit as stop:
         return int(stop.code or 0)
     except SlviewerError as error:

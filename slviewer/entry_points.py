@@ -4,7 +4,10 @@ the program."""
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 IMPORTERS, OPERATIONS = "slviewer.importers", "slviewer.operations"
@@ -26,6 +29,18 @@ class Plugin:
     problem: str = ""
 
 
+def import_modules(package: ModuleType, declaring: str = "") -> list[ModuleType]:
+    """Import the modules of a package that hold what another one looks up, and return them in the
+    order of their names. ``declaring``: a text in the source of each; the others are not
+    imported."""
+    return [
+        import_module(f"{package.__name__}.{path.stem}")
+        for folder in package.__path__
+        for path in sorted(Path(folder).glob("[!_]*.py"))
+        if declaring in path.read_text("utf-8")
+    ]
+
+
 def list_names(group: str) -> list[str]:
     """Return the names of a group's plugins, without importing them."""
     return sorted({entry.name for entry in entry_points(group=group)})
@@ -33,7 +48,7 @@ def list_names(group: str) -> list[str]:
 
 def find_sources(group: str) -> dict[str, str]:
     """Return ``module:object`` of a group's entry points by name, slviewer's own first."""
-    entries = sorted(entry_points(group=group), key=lambda entry: (not _is_own(entry), entry.name))
+    entries = sorted(entry_points(group=group), key=_sort_key)
     sources: dict[str, str] = {}
     for entry in entries:
         sources.setdefault(entry.name, entry.value)
@@ -51,21 +66,33 @@ class PluginGroup(Generic[T]):
 
     @cached_property
     def plugins(self) -> tuple[Plugin, ...]:
-        """All of them, in order of their names, imported when this is first read.
+        """All of them, slviewer's own first, imported when this is first read."""
+        own = (entry for entry in entry_points(group=self.name) if _is_own(entry))
+        return (*(self._import(entry) for entry in sorted(own, key=_sort_key)), *self.others)
+
+    @cached_property
+    def others(self) -> tuple[Plugin, ...]:
+        """Those of other packages, in order of their names, imported when this is first read.
 
         One has a ``problem`` where its import fails, it is not an instance of ``kind``, its
-        ``name`` is not the entry point's, or the name is one of ``built_in`` or of a plugin before
-        it.
+        ``name`` is not the entry point's, or the name is one of ``built_in``, of slviewer's own or
+        of a plugin before it.
         """
-        plugins: list[Plugin] = []
-        entries = [entry for entry in entry_points(group=self.name) if not _is_own(entry)]
-        for entry in sorted(entries, key=lambda entry: (entry.name, _name_package(entry))):
-            taken = {*self.built_in(), *(plugin.name for plugin in plugins if not plugin.problem)}
-            value, problem = None, f"the name {entry.name} is taken: choose another"
-            if entry.name not in taken:
-                value, problem = _load(entry, self.kind)
-            plugins.append(Plugin(self.name, entry.name, _name_package(entry), value, problem))
+        taken, plugins = {*self.built_in()}, list[Plugin]()
+        for entry in sorted(entry_points(group=self.name), key=_sort_key):
+            if not _is_own(entry):
+                plugins.append(self._import(entry, taken))
+                if plugins[-1].problem:
+                    continue
+            taken.add(entry.name)
         return tuple(plugins)
+
+    def _import(self, entry: EntryPoint, taken: Collection[str] = ()) -> Plugin:
+        """Import a plugin, unless its name is ``taken``."""
+        value, problem = None, f"the name {entry.name} is taken: choose another"
+        if entry.name not in taken:
+            value, problem = _load(entry, self.kind)
+        return Plugin(self.name, entry.name, _name_package(entry), value, problem)
 
     def usable(self) -> dict[str, T]:
         """Return the plugins without a problem, by name."""
@@ -93,6 +120,11 @@ def _load(entry: EntryPoint, kind: type) -> tuple[Any, str]:
     return value, ""
 
 
+def _sort_key(entry: EntryPoint) -> tuple[bool, str, str]:
+    """Return what entry points are sorted by: slviewer's own first."""
+    return not _is_own(entry), entry.name, _name_package(entry)
+
+
 def _is_own(entry: EntryPoint) -> bool:
     """Whether an entry point is of slviewer itself."""
     return entry.value.partition(".")[0] == OWN
@@ -108,6 +140,7 @@ def _name_package(entry: EntryPoint) -> str:
 OPERATION_PLUGINS = PluginGroup[Callable[..., Any]](
     OPERATIONS,
     Callable,  # type: ignore[arg-type]
-    lambda: [entry.name for entry in entry_points(group=OPERATIONS) if _is_own(entry)],
+    lambda: (),
 )
-"""Operations of other packages, which register their kinds of records when they are imported."""
+"""Operations that are found by entry points, which register their kinds of records when they are
+imported."""

@@ -30,12 +30,14 @@ from slviewer.devices.drivers import DRIVER_PLUGINS, Driver
 from slviewer.devices.protocols import (
     Camera,
     CameraSettings,
+    ImageProjector,
     Openable,
     Projector,
     Rig,
     Turntable,
     check_angle,
     check_frame,
+    check_image,
     check_index,
     check_level,
     check_sequence,
@@ -77,13 +79,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Board", "BoardType", "Camera", "CameraSettings", "DetectionError", "DeviceError", "Driver",
-    "Exporter", "FolderLayout", "Form", "Found", "Frame", "ImportableRecording", "Input",
-    "InputError", "Job", "Mesh", "Openable", "PanelPlugin", "PatternSequence", "PerAxis",
-    "PointSet", "Projector", "Record", "Rig", "Turntable", "TurntableError",
-    "check_angle", "check_board", "check_camera", "check_complete", "check_exporter", "check_frame",
-    "check_importer", "check_index", "check_level", "check_projector", "check_sequence",
-    "check_turntable", "define_layout", "gray_bits", "has_images", "match_images", "operation",
-    "phase_steps", "render", "unknown_files_warning",
+    "Exporter", "FolderLayout", "Form", "Found", "Frame", "ImageProjector",
+    "ImportableRecording", "Input", "InputError", "Job", "Mesh", "Openable", "PanelPlugin",
+    "PatternSequence", "PerAxis", "PointSet", "Projector", "Record", "Rig", "Turntable",
+    "TurntableError", "check_angle", "check_board", "check_camera", "check_complete",
+    "check_exporter", "check_frame", "check_image", "check_importer", "check_index", "check_level",
+    "check_projector", "check_sequence", "check_turntable", "define_layout", "gray_bits",
+    "has_images", "match_images", "operation", "phase_steps", "render", "unknown_files_warning",
 ]  # fmt: skip
 
 
@@ -198,6 +200,13 @@ def check_projector(projector: Projector) -> Iterator[str]:
             projector.show_level(level)
         for level in (-1, 256):
             yield from _expect(InputError, f"show_level of {level}", projector.show_level, level)
+        if isinstance(projector, ImageProjector):
+            image = np.zeros((height, width, 3), np.uint8)
+            projector.show_image(image)
+            for other_image in (image[1:], image[..., 0], image.astype(np.float32)):
+                what = f"show_image of {other_image.shape} {other_image.dtype}"
+                yield from _expect(InputError, what, projector.show_image, other_image)
+            projector.load(sequence)
         yield from _expect(
             None, "show after show_level, where the sequence stays loaded,", projector.show, 0
         )
@@ -373,7 +382,7 @@ def plugins() -> str:
         *(DRIVER_PLUGINS, BOARD_PLUGINS, LAYOUT_PLUGINS, EXPORTER_PLUGINS),
         *(OPERATION_PLUGINS, PANEL_PLUGINS),
     )
-    found = [plugin for group in groups for plugin in group.plugins]
+    found = [each for group in groups for each in group.others]
     if not found:
         return "no plugins are installed"
     lines = [

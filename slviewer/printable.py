@@ -31,6 +31,11 @@ def escape_controls(text: str) -> str:
     return _UNUSUAL.sub(escape, text)
 
 
+def capitalize(text: str) -> str:
+    """Return text with a capital first letter, and all others as they are."""
+    return text[:1].upper() + text[1:]
+
+
 def format_csv(rows: Iterable[Iterable[object]]) -> str:
     """Return rows as comma-separated values; text in them holds no control characters and no
     formula."""

@@ -147,6 +147,8 @@ def _decode_gray_alone(
     for i in layout.gray:
         height = bit_heights(layout, stack, i, background)
         doubt = np.abs(height) < limit
+        if layout.binary:
+            bit, flipped = np.zeros_like(code), np.zeros_like(code)
         bit ^= height > 0
         flipped ^= (height > 0) ^ doubt
         code, other = 2 * code + bit, 2 * other + flipped

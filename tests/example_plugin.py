@@ -27,7 +27,8 @@ def forget_plugins() -> None:
         *(OPERATION_PLUGINS, PANEL_PLUGINS),
     )
     for group in groups:
-        vars(group).pop("plugins", None)
+        for cached in ("plugins", "others"):
+            vars(group).pop(cached, None)
     drivers.cache_clear()
     for registry in (RECORDS, OPERATIONS):
         registry.pop("brightness", None)

@@ -125,7 +125,7 @@ SLOW = (
 )
 """Commands that take seconds where the damage does not concern them: a tenth as many cases as of
 each other command."""
-DERIVED = ("poses", "evidence", "trust", "compiled", "drift_reference")
+DERIVED = ("poses", "evidence", "trust", "compiled", "drift_floor")
 """Results that a command computes on its way and saves, each whole and from sound inputs: they may
 be new when it ends with a refusal. Where a calibration is rejected, the attempt's verdict too."""
 REJECTED = 3

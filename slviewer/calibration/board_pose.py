@@ -1,17 +1,28 @@
 """The pose of a board, and the lens of a device, from pixels of the board's features; by OpenCV."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from slviewer.errors import CalibrationRejected
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rigid import Floats, transform_from_rvec
+from slviewer.geometry.rigid import Floats, Floats32, transform_from_rvec
+from slviewer.geometry.vectors import diagonal
 
 ITERATIONS = 200
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
 """Where OpenCV's calibrations end."""
+_DIAGONAL = 225.0
+"""Of every board, in the unit in which OpenCV solves: where its steps end depends on that."""
+
+
+def to_solver_unit(points: Sequence[Floats]) -> tuple[list[Floats32], float]:
+    """Return each pose's points (n, 3) mm in the unit in which OpenCV solves, and that unit in
+    mm."""
+    unit = diagonal(np.concatenate(points)) / _DIAGONAL or 1.0
+    return [(each / unit).astype(np.float32) for each in points], unit
 
 
 def solve_pose(
@@ -44,20 +55,42 @@ def intersect_board(T: Floats, rays: Floats) -> Floats:
         return directions * ((T[:3, 2] @ T[:3, 3]) / (directions @ T[:3, 2]))[:, None]
 
 
+@dataclass(frozen=True, eq=False)
+class SolvedDevice:
+    """Pinhole and Brown lens of one device, as OpenCV solved it.
+
+    ``K`` (3, 3) px, ``D`` (5,); ``size``: (width, height) px; ``poses``: T_device_board (4, 4) mm
+    of each pose; ``focal_sigma_px``: standard deviations of fx and fy.
+    """
+
+    K: np.ndarray
+    D: np.ndarray
+    size: tuple[int, int]
+    poses: list[Floats]
+    focal_sigma_px: tuple[float, float]
+
+    @property
+    def lens(self) -> Lens:
+        """The lens. Raises InputError where the solution is not one."""
+        return Lens(self.K, self.D, self.size)
+
+
 def solve_device(
     device: str,
     points: Sequence[np.ndarray],
     pixels: Sequence[np.ndarray],
     size: tuple[int, int],
     start: Lens | None = None,
-) -> tuple[np.ndarray, np.ndarray, list[Floats], tuple[float, float]]:
+    flags: int = 0,
+) -> SolvedDevice:
     """Solve a pinhole and Brown lens from points (n, 3) mm and pixels (n, 2) of each pose.
 
-    Returns K (3, 3), D (5,), T_device_board (4, 4) mm of each pose, and the standard deviations of
-    fx and fy in px. ``device``: for the message of CalibrationRejected, which is raised where
-    OpenCV finds no solution; ``start``: initial lens, by default OpenCV's estimate.
+    ``device``: for the message of CalibrationRejected, which is raised where OpenCV finds no
+    solution; ``start``: initial lens, by default OpenCV's estimate; ``flags``: OpenCV's, of
+    coefficients that are held at 0.
     """
-    objects, images = ([each.astype(np.float32) for each in arrays] for arrays in (points, pixels))
+    objects, unit = to_solver_unit(points)
+    images = [each.astype(np.float32) for each in pixels]
     try:
         _, K, D, rvecs, tvecs, deviations, _, _ = cv2.calibrateCameraExtended(
             objects,
@@ -65,7 +98,7 @@ def solve_device(
             size,
             np.zeros((3, 3)) if start is None else start.K.copy(),
             np.zeros(5) if start is None else start.D.copy(),
-            flags=0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS,
+            flags=flags if start is None else flags | cv2.CALIB_USE_INTRINSIC_GUESS,
             criteria=CRITERIA,
         )
     except cv2.error as error:
@@ -73,6 +106,6 @@ def solve_device(
             f"the {device}'s lens could not be solved from {len(points)} poses",
             f"capture the board in more positions and tilts ({error.err})",
         ) from error
-    poses = [transform_from_rvec(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
+    poses = [transform_from_rvec(r, unit * t) for r, t in zip(rvecs, tvecs, strict=True)]
     fx, fy = deviations.ravel()[:2].tolist()
-    return K, D.ravel()[:5], poses, (fx, fy)
+    return SolvedDevice(K, D.ravel()[:5], size, poses, (fx, fy))

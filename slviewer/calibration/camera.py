@@ -12,6 +12,7 @@ from slviewer.calibration.diagnosis.rules import (
     FEW_POSES,
     HIGH_REPROJECTION_PX,
     MIN_TILT_DEG,
+    describe_constant_pixels,
 )
 from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY
 from slviewer.calibration.squareness import judge_squareness, measure_squareness
@@ -21,8 +22,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats, largest_angle_deg, move_points
 from slviewer.geometry.vectors import rms_length
 from slviewer.records.verdict import Finding, Verdict
-from slviewer.target.board import Board
-from slviewer.target.detect import Detection
+from slviewer.target.board import Board, Detection
 
 MAX_ERROR_RATIO = 3.0
 """Times the usual reprojection error, from which a picture is named: it was blurred, or its board
@@ -38,7 +38,8 @@ class CameraCalibration:
     """A calibrated camera, its reprojection errors, and a verdict on it.
 
     ``rms_px``: reprojection error of all pictures together, ``picture_rms_px`` of each one (RMS
-    length of the residuals). ``focal_sigma_px``: standard deviations of fx and fy, by the residuals
+    length of the residuals), ``features`` how many of the board's each one shows.
+    ``focal_sigma_px``: standard deviations of fx and fy, by the residuals
     or by leaving pictures out, whichever is larger. ``excluded``:
     pictures not used, with the reason.
     """
@@ -47,6 +48,7 @@ class CameraCalibration:
     board: str
     rms_px: float
     picture_rms_px: Mapping[str, float]
+    features: Mapping[str, int]
     focal_sigma_px: tuple[float, float]
     excluded: Mapping[str, str]
     verdict: Verdict
@@ -60,6 +62,7 @@ class CameraCalibration:
             "reprojection_rms_px": self.rms_px,
             "focal_sigma_px": list(self.focal_sigma_px),
             "pictures": dict(self.picture_rms_px),
+            "features": dict(self.features),
             "excluded": dict(self.excluded),
             "verdict": self.verdict,
         }
@@ -68,10 +71,12 @@ class CameraCalibration:
         """Return a report of several lines for the terminal."""
         K, D, (width, height) = self.lens.K, self.lens.D, self.lens.size
         total = len(self.picture_rms_px) + len(self.excluded)
+        seen, on_board = [*self.features.values()], len(Board.parse(self.board).points)
         return "\n".join(
             [
                 self.verdict.text(),
                 f"pictures: {len(self.picture_rms_px)} of {total} used, {width}x{height} px",
+                f"  the board's {on_board} features: {min(seen)} to {max(seen)} seen in a picture",
                 *(f"  excluded: {name}: {why}" for name, why in self.excluded.items()),
                 f"camera: reprojection RMS {self.rms_px:.3f} px",
                 (
@@ -89,28 +94,30 @@ def calibrate_camera(
     detections: Mapping[str, Detection],
     size: Size,
     excluded: Mapping[str, str] | None = None,
+    constant: str = "",
 ) -> CameraCalibration:
     """Calibrate a pinhole camera with Brown distortion (k1 k2 p1 p2 k3) from pictures of a board.
 
     ``detections``: the board's features by picture name; ``size``: (width, height) px of every
     picture. The images of circles are corrected from centroid to centre by a first calibration.
-    ``excluded``: pictures without a board, with the reason. Raises CalibrationRejected for fewer
+    ``excluded``: pictures without a board, with the reason; ``constant``: what never changes in the
+    pictures. Raises CalibrationRejected for fewer
     than three pictures.
     """
     check_pose_count(len(detections), excluded or {})
     points = [board.points[each.ids] for each in detections.values()]
     pixels = [each.pixels for each in detections.values()]
-    lens, poses, sigma = _solve_camera(points, pixels, size)
+    solved = solve_device("camera", points, pixels, size)
     radii = [each.radius_mm for each in detections.values()]
     if any(radii):
         pixels = [
-            centroids - centroid_shifts(lens, T, X, float(np.median(radii)))
-            for centroids, T, X in zip(pixels, poses, points, strict=True)
+            centroids - centroid_shifts(solved.lens, T, X, float(np.median(radii)))
+            for centroids, T, X in zip(pixels, solved.poses, points, strict=True)
         ]
-        lens, poses, sigma = _solve_camera(points, pixels, size)
-    focal = np.diag(lens.K)[:2]
+        solved = solve_device("camera", points, pixels, size)
+    lens, poses = solved.lens, solved.poses
     spread = _focal_spread(points, pixels, lens)
-    sigma = float(max(sigma[0], spread * focal[0])), float(max(sigma[1], spread * focal[1]))
+    fx, fy = np.maximum(solved.focal_sigma_px, spread * np.diag(lens.K)[:2]).tolist()
     residuals = [
         lens.project(move_points(T, X)) - measured
         for X, T, measured in zip(points, poses, pixels, strict=True)
@@ -121,26 +128,16 @@ def calibrate_camera(
         str(board),
         rms_length(np.concatenate(residuals)),
         picture_rms,
-        sigma,
+        {name: len(each.ids) for name, each in detections.items()},
+        (fx, fy),
         dict(excluded or {}),
         Verdict(),
     )
     squareness = measure_squareness(lens, poses, points, pixels)
     findings = [*_judge_camera(unjudged, poses), *judge_squareness(str(board), squareness)]
+    if constant:
+        findings.append(describe_constant_pixels(constant))
     return replace(unjudged, verdict=Verdict.of(findings))
-
-
-def _solve_camera(
-    points: list[Floats], pixels: list[Floats], size: Size
-) -> tuple[Lens, list[Floats], tuple[float, float]]:
-    """Solve the camera's lens from points (n, 3) mm and pixels (n, 2) by picture, as
-    ``solve_device`` does.
-
-    Returns the lens, T_camera_board (4, 4) mm of each picture, and the standard deviations of fx
-    and fy in px.
-    """
-    K, D, poses, sigma = solve_device("camera", points, pixels, size)
-    return Lens(K, D, size), poses, sigma
 
 
 def _focal_spread(points: list[Floats], pixels: list[Floats], lens: Lens) -> float:
@@ -158,7 +155,7 @@ def _focal_spread(points: list[Floats], pixels: list[Floats], lens: Lens) -> flo
     for k in range(groups):
         kept = [i for i in range(count) if i % groups != k]
         fewer, seen = ([each[i] for i in kept] for each in (points, pixels))
-        K, _, _, _ = solve_device("camera", fewer, seen, lens.size, lens)
+        K = solve_device("camera", fewer, seen, lens.size, lens).K
         focal.append(float(np.mean(np.diag(K)[:2] / np.diag(lens.K)[:2])))
     return float(np.sqrt(groups - 1) * np.std(focal))
 

@@ -25,7 +25,7 @@ CORNERS = 64
 def calibrate_centres(
     observations: Sequence[Observation],
     projector_size: tuple[int, int],
-    board: str = "",
+    board: str,
     excluded: Mapping[str, str] | None = None,
     *,
     strict: bool = True,

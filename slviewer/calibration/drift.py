@@ -45,8 +45,8 @@ BOARD_PPM = 5.0
 """Thermal expansion of the board since the calibration: half a kelvin of steel."""
 MAX_MISFIT_RATIO = 3.0
 """Largest RMS that no movement explains, over that of the calibration's worst pose."""
-TURN_MRAD, SHIFT_MM = 0.05, 0.010
-"""Changes that must be detectable."""
+TURN_MRAD, SHIFT_SHARE = 0.05, 5.5e-5
+"""Changes that must be detectable, a shift over the baseline: 10 um at 180 mm."""
 _MOVES = (
     ("turn about its x axis (nod)", "rows", "y"),
     ("turn about its y axis (pan)", "columns", "x"),
@@ -64,16 +64,19 @@ HEIGHT_PX = 1.0
 """Prior sigma of a field's coefficients."""
 UNSUPPORTED_PX = 0.1
 """Largest sigma of the lens error at pixels that are used."""
-RIG_SIGMAS = np.array([3e-3] * 3 + [3.0] * 3)
-"""Prior sigma of the error of the calibration's own relative pose, rad and mm."""
+RIG_SIGMAS = np.array([3e-3] * 3 + [0.017] * 3)
+"""Prior sigma of the error of the calibration's own relative pose, rad and over the baseline."""
+FACTOR_SPREAD = 0.5
+"""Prior sigma of the logarithm of the factor by which a kind's errors are correlated."""
 SAMPLES = 1000
 """Number of pixels of the board at which the projector's coordinates are compared."""
 CELLS_PER_WIDTH = 16
 """Spline cells across an image of the lens errors beyond Brown's model."""
 KINDS = ("camera", "x", "y")
 """Kinds of observations: features in the camera, projector columns, projector rows."""
-STEPS = np.array([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])
-"""Half steps of the numerical derivatives, rad and mm: pixels move by about a tenth."""
+STEPS = np.repeat([1e-4, 3e-4], 3)
+"""Half steps of the numerical derivatives, rad and over the baseline: pixels move by about a
+tenth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,61 +182,66 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
         raise InputError(
             f"{view.name}: no pose of the board fits its features", "is it the calibration's board?"
         )
-    middle = view.points.mean(0)
-
-    def model(at: Floats, moved: Floats | float = 0.0) -> tuple[Floats, Floats]:
-        """Predict features (n, 2) and samples (m, 2) px at changes ``at`` (13,) of board pose,
-        projector, scale."""
-        moved_T = rigid_transform(cv2.Rodrigues(at[:3])[0] @ T[:3, :3], T[:3, 3] + at[3:6])
-        on_board = intersect_board(moved_T, rig.camera.undistort(view.pixels + moved))
-        in_projector = rig.to_projector(on_board) @ cv2.Rodrigues(at[6:9])[0].T + at[9:12]
-        points = middle + (view.points - middle) * (1 + at[12])
-        features = rig.camera.project(move_points(moved_T, points))
-        return features, rig.projector.project(in_projector)
-
+    steps = np.r_[np.tile(STEPS * _units(rig), 2), 1e-4]  # of board pose, projector, scale
     derivatives = np.column_stack(
         [
-            _flatten(*(a - b for a, b in zip(model(step), model(-step), strict=True)))
-            / (2 * step.sum())
-            for step in np.diag(np.r_[STEPS, STEPS, 1e-4])
+            (_predict(rig, view, T, step) - _predict(rig, view, T, -step)) / (2 * step.sum())
+            for step in np.diag(steps)
         ]
     )
-    features, samples = model(np.zeros(13))
-    residuals = _flatten(view.camera - features, view.projector - samples)
+    unchanged = np.zeros(len(steps))
+    predicted = _predict(rig, view, T, unchanged)
+    residuals = _flatten(view.camera, view.projector) - predicted
     usable = finite_rows(residuals[:, None], derivatives[:, 6:12])
     derivatives = np.nan_to_num(derivatives)
     pose, change, scale = derivatives[:, :6], derivatives[:, 6:12], derivatives[:, 12]
-    # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
+    n, m = len(view.camera), len(view.pixels)
+    # how the sample in the projector (u, then v: rows) moves with the pixel in the camera (columns)
     moved = [
-        (model(np.zeros(13), 0.1 * unit)[1] - model(np.zeros(13), -0.1 * unit)[1]) / 0.2
-        for unit in np.eye(2)
+        (_predict(rig, view, T, unchanged, shift) - _predict(rig, view, T, unchanged, -shift)) / 0.2
+        for shift in 0.1 * np.eye(2)
     ]
-    J = np.nan_to_num(np.stack(moved, axis=2))
+    J = np.nan_to_num(np.reshape([each[2 * n :] for each in moved], (2, 2, m)))
     camera, projector = DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)
     on_features, at_pixels = camera.basis(view.camera), camera.basis(view.pixels)
-    on_samples = projector.basis(np.nan_to_num(samples))
-    interleaved = [sp.kron(on_features, unit[:, None]) for unit in np.eye(2)]
-    columns, rows = ([-sp.diags(J[:, row, k]) @ at_pixels for k in (0, 1)] for row in (0, 1))
+    on_samples = projector.basis(np.nan_to_num(predicted[2 * n :].reshape(2, m).T))
     lens_errors = sp.block_array(
         [
-            [*interleaved, None, None],
-            [*columns, on_samples, None],
-            [*rows, None, on_samples],
+            [*(sp.kron(on_features, unit[:, None]) for unit in np.eye(2)), None, None],
+            [*(-sp.diags(each) @ at_pixels for each in J[:, 0]), on_samples, None],
+            [*(-sp.diags(each) @ at_pixels for each in J[:, 1]), None, on_samples],
         ]
     )
-    n, m = len(view.camera), len(view.pixels)
     by_shift = (derivatives[2 * n :, 3:6] @ T[:3, 2]).reshape(2, m)  # along the board's normal
     towards = unit_vectors(by_shift.T)
     return LinearView(
-        np.repeat([0, 1, 2], [2 * n, m, m]),
-        np.where(usable, residuals, 0.0),
-        usable,
-        pose,
-        change,
-        scale,
-        sp.csr_array(sp.hstack([sp.csr_array(change), lens_errors])),
-        np.concatenate([np.zeros(2 * n), -towards[:, 1], towards[:, 0]]),
+        kinds=np.repeat([0, 1, 2], [2 * n, m, m]),
+        residuals=np.where(usable, residuals, 0.0),
+        usable=usable,
+        pose=pose,
+        change=change,
+        scale=scale,
+        shared=sp.csr_array(sp.hstack([sp.csr_array(change), lens_errors])),
+        across=np.concatenate([np.zeros(2 * n), -towards[:, 1], towards[:, 0]]),
     )
+
+
+def _predict(
+    rig: StereoRig, view: DriftView, T: Floats, change: Floats, moved: Floats | float = 0.0
+) -> Floats:
+    """Predict what `_flatten` returns of a view, px, with the board at T_camera_board.
+
+    ``change`` (13,): turn (rad) and shift (mm) of the board, the same of the projector about its
+    own centre, and relative growth of the board. ``moved`` (2,) px: shift of the camera's pixels.
+    """
+    board = rigid_transform(cv2.Rodrigues(change[:3])[0] @ T[:3, :3], T[:3, 3] + change[3:6])
+    on_board = intersect_board(board, rig.camera.undistort(view.pixels + moved))
+    turn = cv2.Rodrigues(change[6:9])[0]
+    in_projector = rig.to_projector(on_board) @ turn.T + change[9:12]
+    middle = view.points.mean(0)
+    points = middle + (view.points - middle) * (1 + change[12])
+    features = rig.camera.project(move_points(board, points))
+    return _flatten(features, rig.projector.project(in_projector))
 
 
 def _flatten(camera: Floats, projector: Floats) -> Floats:
@@ -310,7 +318,7 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
             "calibrate with more poses",
         )
     equations = [linearise_view(rig, view) for view in views]
-    blocks = [sp.diags(RIG_SIGMAS**-2.0)]
+    blocks = [sp.diags((RIG_SIGMAS * _units(rig)) ** -2)]
     for field in (DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)):
         one = field.roughness / ROUGHNESS_PX**2 + sp.eye(field.unknowns) / HEIGHT_PX**2
         blocks += [one, one]
@@ -334,10 +342,11 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
             _compute_weights(e, sigmas, r) for e, r in zip(equations, residuals, strict=True)
         ]
     others = [cho_solve(cho_factor(total - N), right - b) for N, b in parts]
+    scatter = sigmas
     for _ in range(2):  # the weights depend on the sigmas, and the sigmas on the changes
         own = [solve_change(e, g, sigmas) for e, g in zip(equations, others, strict=True)]
         rows = _stack_changes(own)
-        sigmas = _fit_sigmas(rows["change"], rows["spreads"], sigmas)
+        sigmas = _fit_sigmas(rows["change"], rows["spreads"], scatter)
     covariance = cho_solve(factor, np.eye(len(shared)))
     names = np.array([view.name for view in views])
     changes = rows.pop("change")
@@ -426,22 +435,28 @@ def _estimate_sigmas(
     return sigmas
 
 
-def _fit_sigmas(changes: Floats, spreads: Floats, start: Floats) -> Floats:
-    """Fit the sigmas (3,) px by kind by maximum likelihood of the apparent ``changes`` (views, 6)
-    with ``spreads`` (views, 3, 6, 6), whose true value is 0.
+def _fit_sigmas(changes: Floats, spreads: Floats, scatter: Floats) -> Floats:
+    """Fit the sigmas (3,) px by kind to the apparent ``changes`` (views, 6) with ``spreads``
+    (views, 3, 6, 6), whose true value is 0: the most probable ones.
 
-    It exceeds the scatter of the residuals, as errors of neighbouring samples are correlated.
+    They exceed the ``scatter`` (3,) px of the residuals, as errors of neighbouring samples are
+    correlated, by about the same factor in each kind: without this few views are explained best by
+    one kind without any error.
     """
+    least = np.log(scatter)
 
-    def negative_log_likelihood(logs: Floats) -> float:
-        """Return twice the negative log likelihood at the logarithms of the sigmas."""
+    def improbability(logs: Floats) -> float:
+        """Return twice the negative log probability of the logarithms of the sigmas."""
         L = np.linalg.cholesky(np.tensordot(spreads, np.exp(2 * logs), (1, 0)))
         whitened = np.linalg.solve(L, changes[..., None])
-        return float(2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum() + (whitened**2).sum())
+        likelihood = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum() + (whitened**2).sum()
+        return float(likelihood + 3 * np.var(logs - least) / FACTOR_SPREAD**2)
 
     options = {"xatol": 0.02, "fatol": 0.01}
-    first = np.log(4 * start)
-    result = minimize(negative_log_likelihood, first, method="Nelder-Mead", options=options)
+    bounds = [(each, None) for each in least]
+    result = minimize(
+        improbability, least + np.log(4), method="Nelder-Mead", bounds=bounds, options=options
+    )
     return np.exp(result.x)
 
 
@@ -461,7 +476,9 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     C += growth**2 * np.outer(estimate.by_growth, estimate.by_growth)
     information = np.linalg.inv(C)
     squared_distance = float(estimate.change @ information @ estimate.change)
-    degrees = reference.changes.size - 3  # the floor is itself an estimate, from so many numbers
+    # the floor is itself an estimate: three numbers a view, as the six share its lens errors, less
+    # the sigmas and the calibration's own relative pose
+    degrees = 3 * len(reference.changes) - 9
     chance = float(fdtrc(6, degrees, squared_distance / 6))
     limit = 6 * float(fdtri(6, degrees, 1 - FALSE_ALARMS))
     scale, offset, misfit = estimate.figures.tolist()
@@ -511,7 +528,7 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
         chance=chance,
         seen_alone=tuple(seen_alone.tolist()),
         unseen=(
-            *_list_undetermined(seen_alone, view.axes),
+            *_list_undetermined(seen_alone, reference.rig.baseline_mm, view.axes),
             "common motion of both devices (harmless)",
         ),
     )
@@ -543,12 +560,17 @@ def _list_movements(
     )
 
 
-def _list_undetermined(seen_alone: Floats, axes: Sequence[Axis]) -> list[str]:
+def _units(rig: StereoRig) -> Floats:
+    """Return the units (6,) of a pose's turns and shifts: 1 rad, and the baseline in mm."""
+    return np.repeat([1.0, rig.baseline_mm], 3)
+
+
+def _list_undetermined(seen_alone: Floats, baseline_mm: float, axes: Sequence[Axis]) -> list[str]:
     """Describe the movements whose detection limits (6,) mrad and mm are too large, with the reason
     and remedy."""
     undetermined = []
     for i, (move, lines, axis) in enumerate(_MOVES):
-        if seen_alone[i] > (TURN_MRAD if i < 3 else SHIFT_MM):
+        if seen_alone[i] > (TURN_MRAD if i < 3 else SHIFT_SHARE * baseline_mm):
             size = f"{seen_alone[i]:.2f} mrad" if i < 3 else f"{1e3 * seen_alone[i]:.0f} um"
             why = (
                 f"it moves the pattern's {lines}, and the capture holds axis {axes[0]} alone"

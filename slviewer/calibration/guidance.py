@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import cholesky, eigh, solve_triangular
 from scipy.spatial.transform import Rotation
 
+from slviewer.calibration.board_pose import SolvedDevice, solve_device
 from slviewer.calibration.next_pose import depth_range, place_board
 from slviewer.calibration.splined.bundle import compute_point_jacobian
 from slviewer.calibration.splined.normal import (
@@ -44,9 +45,10 @@ from slviewer.calibration.splined.unknowns import (
     UnknownLayout,
     board_frame,
 )
+from slviewer.calibration.stereo import DEVICES
+from slviewer.errors import CalibrationRejected
 from slviewer.fringe.sequence import Size
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import (
@@ -56,7 +58,6 @@ from slviewer.geometry.rigid import (
     move_points,
     nearest_rotation,
     rotation_angle,
-    transform_from_rvec,
 )
 from slviewer.geometry.vectors import box_middle, finite_rows, lengths
 from slviewer.target.board import Board
@@ -245,13 +246,20 @@ def estimate_rig(
     if len(features) < MIN_POSES or any(len(each[0]) < MIN_FEATURES for each in features):
         return None
     boards, *images = zip(*features, strict=True)
-    devices = (
-        _calibrate_device(boards, seen, size) for seen, size in zip(images, sizes, strict=True)
-    )
-    (camera_lens, poses), (projector_lens, projector_poses) = devices
-    if camera_lens is None or projector_lens is None:
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    if len(boards) < POSES_FOR_TWO_COEFFICIENTS:
+        flags |= cv2.CALIB_FIX_K2
+    try:
+        of_camera, of_projector = (
+            solve_device(device, boards, seen, size, flags=flags)
+            for device, seen, size in zip(DEVICES, images, sizes, strict=True)
+        )
+    except CalibrationRejected:
         return None
-    T = np.array(projector_poses) @ np.linalg.inv(poses)  # T_projector_camera by each pose
+    if not (_is_plausible(of_camera) and _is_plausible(of_projector)):
+        return None
+    poses = of_camera.poses
+    T = np.array(of_projector.poses) @ np.linalg.inv(poses)  # T_projector_camera by each pose
     t = np.median(T[:, :3, 3], axis=0)
     R = nearest_rotation(np.median(T[:, :3, :3], axis=0))
     rotation = np.median(rotation_angle(T[:, :3, :3] @ R.T))
@@ -259,28 +267,14 @@ def estimate_rig(
     is_behind = any(pose[2, 3] <= 0 for pose in poses)
     if rotation > MAX_DISAGREEMENT[0] or translation > MAX_DISAGREEMENT[1] or is_behind:
         return None
-    return StereoRig(camera_lens, projector_lens, R, t), poses
+    return StereoRig(of_camera.lens, of_projector.lens, R, t), poses
 
 
-def _calibrate_device(
-    points: Sequence[Floats], pixels: Sequence[np.ndarray], size: Size
-) -> tuple[Lens | None, list[Floats]]:
-    """Estimate a lens and T_device_board (4, 4) mm of each pose; None without a plausible
-    solution."""
-    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    if len(points) < POSES_FOR_TWO_COEFFICIENTS:
-        flags |= cv2.CALIB_FIX_K2
-    try:
-        _, K, D, rvecs, tvecs = cv2.calibrateCamera(
-            points, pixels, size, np.eye(3), np.zeros(5), flags=flags
-        )
-    except cv2.error:
-        return None, []
-    focals = np.array([K[0, 0], K[1, 1] / 2]) / size[0]
-    if not (np.isfinite(K).all() and (_FOCALS[0] < focals).all() and (focals < _FOCALS[1]).all()):
-        return None, []
-    poses = [transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)]
-    return Lens(K, np.ravel(D)[:5], size), poses
+def _is_plausible(device: SolvedDevice) -> bool:
+    """Whether a lens has focal lengths as lenses have them."""
+    low, high = _FOCALS
+    focals = np.array([device.K[0, 0], device.K[1, 1] / 2]) / device.size[0]
+    return bool(np.isfinite(device.K).all() and (low < focals).all() and (focals < high).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,9 +290,7 @@ class Guidance:
     sigma_next_mm: float
 
 
-def suggest_poses(
-    model: GuidanceModel, poses: Sequence[Floats], trials: int = TRIALS
-) -> Guidance | None:
+def suggest_poses(model: GuidanceModel, poses: Sequence[Floats], trials: int) -> Guidance | None:
     """Recommend the next poses after ``poses``, T_camera_board (4, 4) mm each; None where no pose
     is visible.
 

@@ -13,7 +13,7 @@ a smoothed surface is smallest where 2 sigma are excluded; with more, the loss o
 noise.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -23,6 +23,7 @@ import numpy as np
 
 from slviewer.calibration.local_fit import fit_local_values
 from slviewer.errors import DetectionError, InputError
+from slviewer.fringe.image_area import ImageArea, combine_areas
 from slviewer.fringe.phase import PhaseMap, PhaseMaps
 from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
@@ -30,12 +31,12 @@ from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.robust import RAYLEIGH_MEDIAN
 from slviewer.geometry.splines import SplineSurface, fit_spline
 from slviewer.geometry.vectors import finite_rows, lengths, rms
-from slviewer.target.board import Board
-from slviewer.target.detect import Detection, board_mask
+from slviewer.target.board import Board, Detection
+from slviewer.target.detect import board_mask
 
 T = TypeVar("T")
 Result = TypeVar("Result")
-READING_VERSION = 4
+READING_VERSION = 8
 """Version of ``observe``; observations that a session saved with another version are computed
 again."""
 SAMPLES = 30_000
@@ -208,7 +209,7 @@ def block_samples(
     camera = np.stack([mean(u), mean(v)], axis=1)
     projector, sigma = np.full((2, len(chosen), 2), np.nan)
     for axis, phase in phases.items():
-        column, px = AXES.index(axis), phase.period_px / (2 * np.pi)
+        column, px = AXES.index(axis), phase.px_per_rad
         projector[:, column] = mean(phase.phase[v, u].astype(float) * px)
         sigma[:, column] = np.sqrt(
             mean((phase.sigma_phase[v, u].astype(float) * px) ** 2) * inverse
@@ -246,9 +247,11 @@ class Observation:
     ``slopes`` (n, 2, 2): Jacobian of the projector coordinates by camera pixels at each feature.
     ``radius_mm``: of circles, whose pixels are the centroids of their images (see
     ``calibration.centres``); 0 where they are centres. ``marked``: whether the board's mark was
-    detected, so that the numbering is unambiguous. ``samples``: unsmoothed phase at bright blocks;
-    None in older observations. ``light``: of two cameras, where "projector" stands for the second
-    one, the same features as the projector itself lit them; None where it lit one axis.
+    detected, so that the numbering is unambiguous; ``others`` (k, n, 3) mm: further ``points`` that
+    the image allows, where its border hides which features these are. ``samples``: unsmoothed phase
+    at bright blocks; None in older observations. ``light``: of two cameras, where "projector"
+    stands for the second one, the same features as the projector itself lit them; None where it lit
+    one axis. ``area``: the part of the image that changed between the pose's frames.
     """
 
     name: str
@@ -263,8 +266,10 @@ class Observation:
     slopes: Floats | None = field(default=None, repr=False)
     radius_mm: float = 0.0
     marked: bool = False
+    others: Floats | None = field(default=None, repr=False)
     samples: Samples | None = field(default=None, repr=False)
     light: "Observation | None" = field(default=None, repr=False)
+    area: ImageArea | None = field(default=None, repr=False)
 
     @property
     def region(self) -> Mask:
@@ -295,10 +300,13 @@ class Observation:
         names = ("points", "camera", "projector", "size", "box", "radius_mm", "marked")
         arrays = {name: np.asarray(getattr(self, name)) for name in names}
         arrays["region"] = self.packed_region
-        if self.slopes is not None:
-            arrays["slopes"] = self.slopes
+        for name in ("slopes", "others"):
+            if (values := getattr(self, name)) is not None:
+                arrays[name] = values
         if self.samples is not None:
             arrays |= {f"samples_{name}": values for name, values in vars(self.samples).items()}
+        if self.area is not None:
+            arrays |= self.area.to_arrays()
         for axis, surface in self.surfaces.items():
             trend = surface.trend if isinstance(surface, SplineSurface) else surface
             arrays |= {
@@ -344,9 +352,17 @@ class Observation:
             arrays.get("slopes"),
             float(arrays.get("radius_mm", 0.0)),
             bool(arrays.get("marked", False)),
+            arrays.get("others"),
             samples,
             cls.from_arrays(name, of_light) if of_light else None,
+            ImageArea.from_arrays(arrays),
         )
+
+
+def combine_observed(observations: Iterable[Observation]) -> ImageArea | None:
+    """Return the part of the camera's image that changes in these poses, as `combine_areas`
+    does."""
+    return combine_areas([o.area for o in observations])
 
 
 def observe(
@@ -355,9 +371,10 @@ def observe(
     detection: Detection,
     phases: PhaseMaps,
     smoothing: Smoothing | None = None,
+    area: ImageArea | None = None,
 ) -> Observation:
     """Compute the observation of one pose from its detected board and its decoded phase maps by
-    axis.
+    axis. ``area``: the part of the image that changes, all of it if None.
 
     Raises DetectionError where too few pixels of the board carry a usable pattern.
     """
@@ -386,7 +403,8 @@ def observe(
     for axis, phase in phases.items():
         weighted[axis] = phase.phase[part], _phase_weight(phase, bright[axis])[part]
         supported &= _is_near_bright(bright[axis], reach=typical_pitch)
-    surfaces = smooth_axes(weighted, box, width, typical_pitch, smoothing or Smoothing())
+    across = width if area is None else area.box[2] - area.box[0]
+    surfaces = smooth_axes(weighted, box, across, typical_pitch, smoothing or Smoothing())
     return Observation(
         name=name,
         points=board.points[detection.ids],
@@ -400,7 +418,9 @@ def observe(
         slopes=slopes,
         radius_mm=detection.radius_mm,
         marked=detection.marked,
+        others=board.points[detection.others] if len(detection.others) else None,
         samples=block_samples(phases, bright),
+        area=area,
     )
 
 

@@ -11,15 +11,16 @@ rational family as it is, ``zeta = (a0 + a1 s)/(1 + a2 s)``, and keeps the sums 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slviewer.calibration.observe import Observation
+from slviewer.calibration.observe import Observation, combine_observed
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected
+from slviewer.fringe.image_area import ImageArea
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel, run_rows
@@ -27,6 +28,7 @@ from slviewer.geometry.rigid import Floats, Floats32
 from slviewer.geometry.shapes import Plane, fit_plane
 from slviewer.geometry.triangulation import MARGIN, depth_per_px, ray_depth, triangulate_pixels
 from slviewer.records.calibration import AxisFit, PixelwiseFit
+from slviewer.records.record import from_plain
 
 PLANE_PIXELS = 30_000
 """Approximate number of pixels in a pose's plane fit; the phase is smooth, and more pixels do not
@@ -69,13 +71,15 @@ class PixelwiseModel:
 
     ``periods_px`` is the fringe period of the coefficients' phase; the phase of captures with
     another period is converted. ``planes`` are the ideal planes of the target poses (eq. 12),
-    reconstructed from ``depth_axis``.
+    reconstructed from ``depth_axis``. ``area``: the part of the camera's image that changes, all of
+    it if None.
     """
 
     fits: Mapping[Axis, PixelFit]
     periods_px: Mapping[Axis, float]
     planes: Mapping[str, Plane]
     depth_axis: Axis
+    area: ImageArea | None = None
 
     name = "pixelwise"
 
@@ -121,17 +125,18 @@ class PixelwiseModel:
         for axis, fit in self.fits.items():
             fitted = np.isfinite(fit.coefficients[0])
             poses = float(np.median(fit.poses[fitted]))
-            axes[str(axis)] = AxisFit(
-                float(fitted.mean()), poses, *self.median_rms_mm(axis).values()
-            )
+            pixels = fitted.size if self.area is None else self.area.area_px
+            share = min(np.count_nonzero(fitted) / pixels, 1.0)
+            axes[str(axis)] = AxisFit(share, poses, *self.median_rms_mm(axis).values())
         return PixelwiseFit(axes)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return named arrays for saving."""
         keys = PixelFit.__annotations__
-        return {
+        arrays = {
             f"{axis}_{key}": getattr(fit, key) for axis, fit in self.fits.items() for key in keys
         }
+        return arrays | (self.area.to_arrays() if self.area else {})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields that are not images, as JSON types."""
@@ -148,16 +153,28 @@ class PixelwiseModel:
     def from_arrays(
         cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> "PixelwiseModel":
-        """Return the model that ``to_dict`` and ``to_arrays`` saved."""
+        """Return the model that ``to_dict`` and ``to_arrays`` saved. Raises InputError that names
+        an invalid field."""
+        saved = from_plain(data, _SavedModel)
         keys = PixelFit.__annotations__
         fits = {
             axis: PixelFit(**{key: arrays[f"{axis}_{key}"] for key in keys})
-            for axis in data["periods_px"]
+            for axis in saved["periods_px"]
         }
         planes = {
-            name: Plane(np.array(values[:3]), values[3]) for name, values in data["planes"].items()
+            name: Plane(np.array(normal), offset)
+            for name, (*normal, offset) in saved["planes"].items()
         }
-        return cls(fits, data["periods_px"], planes, data["depth_axis"])
+        area = ImageArea.from_arrays(arrays)
+        return cls(fits, saved["periods_px"], planes, saved["depth_axis"], area)
+
+
+class _SavedModel(TypedDict):
+    """What `PixelwiseModel.to_dict` returns."""
+
+    periods_px: dict[Axis, float]
+    planes: dict[str, tuple[float, float, float, float]]
+    depth_axis: Axis
 
 
 def calibrate_pixelwise(
@@ -184,6 +201,7 @@ def calibrate_pixelwise(
         {axis: used[0].periods_px[axis] for axis in axes},
         {o.name: ideal_plane(o, stereo, depth_axis) for o in used},
         depth_axis,
+        combine_observed(used),
     )
     band = max(1, min(height, BAND_BYTES // (8 * len(used) * width * (len(axes) + 1))))
     # allocated once: new memory is slow at first

@@ -131,7 +131,7 @@ def _explain_aspect(features: Sequence[tuple[Floats, Floats]], size: tuple[int, 
     stretch = 1.0
     for _ in range(3):
         scaled = [X * [1.0, stretch, 1.0] for X, _ in features]
-        K, _, _, _ = solve_device("camera", scaled, images, size)
+        K = solve_device("camera", scaled, images, size).K
         stretch *= float(K[1, 1] / K[0, 0])
     return stretch
 

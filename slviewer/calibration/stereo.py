@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slviewer.calibration.board_pose import CRITERIA, solve_device
+from slviewer.calibration.board_pose import CRITERIA, solve_device, to_solver_unit
 from slviewer.calibration.known_camera import KnownCamera, Views, solve_beside
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.calibration.observe import Observation
@@ -92,7 +92,7 @@ class StereoModel:
     @property
     def baseline_mm(self) -> float:
         """Distance between the two devices' centres."""
-        return float(np.linalg.norm(self.rig.t))
+        return self.rig.baseline_mm
 
     @property
     def reprojection(self) -> Reprojection:
@@ -307,20 +307,21 @@ def _solve_both(
     Returns the rig, T_camera_board (4, 4) mm of each pose, and the focal lengths' standard
     deviations; raises as ``_solve``.
     """
-    objects, cameras, projectors = (
+    points, cameras, projectors = (
         [each.astype(np.float32) for each in arrays] for arrays in zip(*views, strict=True)
     )
+    objects, unit = to_solver_unit(points)
     sigma: dict[str, float] = {}
     intrinsics = []
     starts = None if camera is None else camera.lens, None
     for device, images, size, start in zip(
         DEVICES, (cameras, projectors), sizes, starts, strict=True
     ):
-        K, D, _, sigmas = solve_device(device, objects, images, size, start)
-        sigma[device] = max(sigmas)
+        solved = solve_device(device, points, images, size, start)
+        sigma[device] = max(solved.focal_sigma_px)
         if strict:
-            _check_focal(device, sigma[device], K)
-        intrinsics += [K, D]
+            _check_focal(device, sigma[device], solved.K)
+        intrinsics += [solved.K, solved.D]
     K_c, D_c, K_p, D_p = intrinsics
     alone = [np.diag(K).copy() for K in (K_c, K_p)]  # OpenCV overwrites both
     _, K_c, D_c, K_p, D_p, R, T, _, _, rvecs, tvecs, _ = cv2.stereoCalibrateExtended(
@@ -348,8 +349,9 @@ def _solve_both(
         # systematic errors, which the standard deviations lack, change the two fits differently
         change = np.abs(f / np.diag(K) - 1).max()
         sigma[device] = max(sigma[device], float(change * min(K[0, 0], K[1, 1])))
-    rig = StereoRig(Lens(K_c, D_c, sizes[0]), Lens(K_p, D_p, sizes[1]), R, T)
-    return rig, [transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)], sigma
+    rig = StereoRig(Lens(K_c, D_c, sizes[0]), Lens(K_p, D_p, sizes[1]), R, unit * T)
+    poses = [transform_from_rvec(r, unit * t) for r, t in zip(rvecs, tvecs, strict=True)]
+    return rig, poses, sigma
 
 
 def _check_focal(device: str, sigma_px: float, K: Floats) -> None:
@@ -409,7 +411,7 @@ def check_pose_count(count: int, excluded: Mapping[str, str]) -> None:
         )
 
 
-def check_tilts(used: Sequence[Observation], camera: KnownCamera | None = None) -> None:
+def check_tilts(used: Sequence[Observation], camera: KnownCamera | None) -> None:
     """Raise CalibrationRejected where all boards are nearly parallel, unless the camera is fixed.
 
     Parallel boards share their vanishing line and do not determine the focal length.

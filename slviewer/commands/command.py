@@ -11,18 +11,19 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, fields, is_dataclass
+from dataclasses import KW_ONLY, dataclass, fields, is_dataclass, replace
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from types import GenericAlias, MappingProxyType
+from types import GenericAlias, MappingProxyType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import tyro
 
 from slviewer import terminal
-from slviewer.errors import SlviewerError
+from slviewer.errors import SlviewerError, UsageError
 from slviewer.inputs import LARGEST, Input, find_input
 
 ModelName = Literal["stereo", "pixelwise", "splined"]
@@ -36,6 +37,12 @@ Work = Callable[[], None]
 Command = Callable[..., Work]
 """Called with the arguments; what it returns does the work."""
 Run = Callable[[Function, Arguments], None]
+CONFIG = (
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.OmitSubcommandPrefixes,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.PositionalMetavarFromFieldName,
+)
 TYPES: dict[str, Any] = {
     "SessionLike": Path,
     "ModelName": ModelName,
@@ -82,22 +89,19 @@ def read_command(
     module, name = _find_module(source)
     text, own = _read_function(module, name)
     parts = [own, *(_read_settings(*_find_module(each)) for each in options)]
-    described = "\n".join(each for each, _ in parts)
+    described = "\n".join(each.text for each in parts)
     parameters, declared = [], dict[str, Input]()
-    for argument, default, place in _list_described(parts):
-        assert argument.annotation is not None
-        annotation = place.evaluate(argument.annotation)
-        declared[argument.arg] = find_input(annotation) or Input()
-        kind = _terminal_type(annotation)
-        value = inspect.Parameter.empty if default is None else place.evaluate(default)
-        if argument.arg in optional:
+    for each in (parameter for part in parts for parameter in part.list_described()):
+        declared[each.name] = find_input(each.kind) or Input()
+        kind, value = _terminal_type(each.kind), each.value
+        if each.name in optional:
             kind, value = kind | None, None
-        if argument.arg in positional or (argument.arg == "session" and default is None):
-            kind = Annotated[kind, tyro.conf.Positional]
-        if argument.arg in names:
-            kind = Annotated[kind, tyro.conf.arg(name=names[argument.arg])]
+        is_positional = each.name in positional or (each.name == "session" and each.is_required)
+        kind = _annotate(kind, value, is_positional)
+        if each.name in names:
+            kind = Annotated[kind, tyro.conf.arg(name=names[each.name])]
         keyword = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(inspect.Parameter(argument.arg, keyword, annotation=kind, default=value))
+        parameters.append(inspect.Parameter(each.name, keyword, annotation=kind, default=value))
 
     def parse(**arguments: Any) -> Work:
         """Return the work to do: the function, imported only when it is called, with the parsed
@@ -112,25 +116,107 @@ def read_command(
 
     # each argument on one line: tyro would break the help where the source is broken
     joined = _add_ranges(re.sub(r"\n {8,}(?=\S)", " ", described), declared)
-    parse.__doc__ = (description or text) + (joined and f"\n\nArgs:\n{joined}")
+    parse.__doc__ = (description or _remove_errors(text)) + (joined and f"\n\nArgs:\n{joined}")
     parse.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     parse.__annotations__ = {each.name: each.annotation for each in parameters}
+    parse.options = {  # type: ignore[attr-defined]
+        _option(f"no_{each.name}" if each.default is True else names.get(each.name, each.name))
+        for each in parameters
+        if tyro.conf.Positional not in get_args(each.annotation)
+    }
     return parse
+
+
+def read_description(source: str) -> str:
+    """Return what the function ``module:function`` says of itself, without reading its
+    arguments."""
+    return _remove_errors(_read_function(*_find_module(source))[0])
+
+
+def parse_command(command: Function, name: str, arguments: Sequence[str]) -> Work:
+    """Return the work of a command with these arguments of the terminal; ``name``: of the command.
+
+    Raises UsageError for an option that the command does not have, before tyro assigns the words
+    behind it to other arguments; SystemExit for the help and for what tyro refuses.
+    """
+    known = {"--help", *command.options}  # type: ignore[attr-defined]
+    for each in arguments:
+        option = _option(each.partition("=")[0].removeprefix("--"))
+        if each.startswith("--") and each != "--" and option not in known:
+            near = "".join(f" (did you mean {x}?)" for x in get_close_matches(option, known, 1))
+            raise UsageError(
+                f"{name} has no option {option}{near}",
+                f"`slviewer {name} --help` lists its options",
+            )
+    with _REGISTRY:
+        return tyro.cli(command, prog=f"slviewer {name}", args=arguments, config=CONFIG)
+
+
+def _option(name: str) -> str:
+    """Return the option of an argument."""
+    return f"--{name.replace('_', '-')}"
+
+
+_REGISTRY = tyro.constructors.ConstructorRegistry()
+
+
+_NUMBERS: dict[Any, str] = {int: "a whole number such as 12", float: "a number such as 0.5 or 12"}
+
+
+@_REGISTRY.primitive_rule
+def _read_number(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """Read a number; another text is refused with an example."""
+    kind = info.type
+    if kind not in _NUMBERS:
+        return None
+
+    def parse(texts: list[str]) -> Any:
+        """Return the number. Raises ValueError, with what is expected, for any other text."""
+        try:
+            return kind(texts[0])
+        except ValueError:
+            raise ValueError(f"{texts[0]!r} is not {_NUMBERS[kind]}") from None
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=parse,
+        is_instance=lambda value: isinstance(value, (int, kind)) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+@_REGISTRY.primitive_rule
+def _omit_none(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """Read an argument that may be None as one that may not: on the terminal it is omitted."""
+    if get_origin(info.type) not in (Union, UnionType):
+        return None
+    kinds = [each for each in get_args(info.type) if each is not type(None)]
+    if len(kinds) != 1:
+        return None
+    inner = replace(info, type=kinds[0], type_origin=get_origin(kinds[0]))
+    spec = tyro.constructors.ConstructorRegistry.get_primitive_spec(inner)
+    assert isinstance(spec, tyro.constructors.PrimitiveConstructorSpec)
+    return replace(
+        spec,
+        is_instance=lambda value: value is None or spec.is_instance(value),
+        str_from_instance=lambda value: [] if value is None else spec.str_from_instance(value),
+    )
 
 
 def read_operation(source: str) -> Command:
     """Return the command of an operation ``module:function``. What has no default is positional, up
     to the first of several values."""
-    module, name = _find_module(source)
-    _, (_, accepted) = _read_function(module, name)
     positional = []
-    for argument, default, place in accepted:
-        assert argument.annotation is not None
-        kind = place.evaluate(argument.annotation)
-        if default is not None or kind is KW_ONLY:
+    for each in _read_function(*_find_module(source))[1].parameters:
+        if not each.is_required or each.kind is KW_ONLY:
             break
-        positional.append(argument.arg)
-        if getattr(kind, "__origin__", None) is Sequence:
+        positional.append(each.name)
+        if getattr(each.kind, "__origin__", None) is Sequence:
             break
     return read_command(source, *positional, options=JSON)
 
@@ -188,14 +274,20 @@ def union(commands: Mapping[str, Function]) -> Any:
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
 
 
-def _list_described(parts: Sequence["Described"]) -> list["Argument"]:
-    """Return the arguments that are described: the others are for Python alone."""
-    return [
-        argument
-        for text, arguments in parts
-        for argument in arguments
-        if re.search(rf"^ {{4}}{argument[0].arg}:", text, re.MULTILINE)
-    ]
+def _annotate(kind: Any, value: Any, is_positional: bool) -> Any:
+    """Return a type for the terminal of an argument with this default, which its help omits where
+    it states nothing."""
+    is_empty = value is None or isinstance(value, bool) or value in ("", ())
+    if is_empty or (is_positional and get_origin(kind) is tuple):
+        kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
+    return Annotated[kind, tyro.conf.Positional] if is_positional else kind
+
+
+def _remove_errors(text: str) -> str:
+    """Return a description without its sentences on exceptions and returned values, which are for
+    Python, and with the terminal's quotes."""
+    sentences = re.compile(r"(?:^|(?<=[.\n])[ \n])(?:Raises|Returns) [^\n]+(?:\n[^\n]+)*", re.M)
+    return sentences.sub("", text).replace("``", "`").rstrip()
 
 
 def _add_ranges(described: str, declared: Mapping[str, Input]) -> str:
@@ -214,16 +306,55 @@ def _check_numbers(
     """Raise UsageError for a number among the arguments that is not what was declared, under the
     name of its option."""
     for name, value in arguments.items():
-        declared[name].check(f"--{names.get(name, name).replace('_', '-')}", value)
+        declared[name].check(_option(names.get(name, name)), value)
 
 
-Argument = tuple[ast.arg, ast.expr | None, "_Module"]
-"""A parameter, its default, None where it has none, and the module in which both are evaluated."""
-Described = tuple[str, list[Argument]]
-"""What a docstring says of parameters below ``Args:``, and these."""
+@dataclass(frozen=True)
+class _Parameter:
+    """A parameter of a function, or a field of its settings, as the source of its ``module`` has
+    it; ``default`` is None where there is none."""
+
+    name: str
+    annotation: ast.expr | None
+    default: ast.expr | None
+    module: "_SourceModule"
+
+    @property
+    def is_required(self) -> bool:
+        """Whether it has no default."""
+        return self.default is None
+
+    @property
+    def kind(self) -> Any:
+        """Its type."""
+        assert self.annotation is not None
+        return self.module.evaluate(self.annotation)
+
+    @property
+    def value(self) -> Any:
+        """Its default."""
+        if self.default is None:
+            return inspect.Parameter.empty
+        return self.module.evaluate(self.default)
 
 
-def _find_module(source: str) -> tuple["_Module", str]:
+@dataclass(frozen=True)
+class _Described:
+    """All parameters of a function or its settings, and the ``text`` below ``Args:``."""
+
+    text: str
+    parameters: list[_Parameter]
+
+    def list_described(self) -> list[_Parameter]:
+        """Return the parameters that the text describes: the others are for Python alone."""
+        return [
+            each
+            for each in self.parameters
+            if re.search(rf"^ {{4}}{each.name}:", self.text, re.MULTILINE)
+        ]
+
+
+def _find_module(source: str) -> tuple["_SourceModule", str]:
     """Return module and name of ``module:name``, of slviewer's where it has that one."""
     module, _, name = source.partition(":")
     own = PACKAGE / f"{module.replace('.', '/')}.py"
@@ -236,9 +367,13 @@ _STATEMENT = re.compile(
 """Beginning of a statement of a module: a decorator, a definition, an import or a value."""
 
 
-class _Module(dict[str, Any]):
-    """Types and constants of a module by name. Those of slviewer are evaluated from their source,
-    statement by statement where they are used; the module is not imported."""
+class _SourceModule(dict[str, Any]):
+    """The names of a module, as `eval` looks them up, without importing the module and NumPy.
+
+    Its source is split into statements, and each is parsed only when its name is looked up. A class
+    or a function is a node of the source, a constant its value. What is imported from slviewer is
+    read from the other module's source in the same way; other packages are imported.
+    """
 
     def __init__(self, name: str) -> None:
         super().__init__(TYPES)
@@ -305,13 +440,14 @@ class _Module(dict[str, Any]):
 
     def evaluate(self, expression: ast.expr) -> Any:
         """Evaluate an annotation or a default of the module."""
-        return eval(ast.unparse(expression), {}, self)  # noqa: S307, our own source
+        code = compile(ast.fix_missing_locations(ast.Expression(expression)), self.name, "eval")
+        return eval(code, {}, self)  # noqa: S307, our own source
 
 
-_read_module = cache(_Module)
+_read_module = cache(_SourceModule)
 
 
-def _read_function(module: _Module, name: str) -> tuple[str, Described]:
+def _read_function(module: _SourceModule, name: str) -> tuple[str, _Described]:
     """Return what the docstring of a function says before ``Args:`` and below it, and the
     function's parameters; where it has settings, the latter are those of the settings."""
     definition = module.find_node(name)
@@ -320,10 +456,10 @@ def _read_function(module: _Module, name: str) -> tuple[str, Described]:
     for decorator in definition.decorator_list:
         match decorator:
             case ast.Call(ast.Name("operation"), [_, _, ast.Name(settings)]):
-                described, accepted = _read_settings(module, settings)
-                session = ast.arg("session", ast.Name("SessionLike")), None, module
-                described = f"    session: Session folder.\n{described}"
-                return text, (described, [session, *accepted])
+                own = _read_settings(module, settings)
+                session = _Parameter("session", ast.Name("SessionLike", ast.Load()), None, module)
+                described = f"    session: Session folder.\n{own.text}"
+                return text, _Described(described, [session, *own.parameters])
             case ast.Call(ast.Name("takes_settings"), [ast.Name(settings)]):
                 return text, _read_settings(module, settings)
     arguments = definition.args
@@ -334,10 +470,11 @@ def _read_function(module: _Module, name: str) -> tuple[str, Described]:
     ]
     if not described:
         text = text.partition("\n\n")[0]
-    return text, (described.partition("\n\n")[0], [(*pair, module) for pair in pairs])
+    parameters = [_Parameter(each.arg, each.annotation, value, module) for each, value in pairs]
+    return text, _Described(described.partition("\n\n")[0], parameters)
 
 
-def _read_settings(module: _Module, name: str) -> Described:
+def _read_settings(module: _SourceModule, name: str) -> _Described:
     """Return what a dataclass of settings and its bases describe of their fields, and these
     fields."""
     match module.find_node(name):
@@ -347,25 +484,23 @@ def _read_settings(module: _Module, name: str) -> Described:
             doc = ast.get_docstring(settings) or ""
     described = [doc.partition("Args:\n")[2].partition("\n\n")[0]]
     accepted = [
-        (ast.arg(ast.unparse(node.target), node.annotation), node.value, module)
+        _Parameter(ast.unparse(node.target), node.annotation, node.value, module)
         for node in settings.body
-        if isinstance(node, ast.AnnAssign)
+        if isinstance(node, ast.AnnAssign) and ast.unparse(node.annotation) != "ClassVar"
     ]
     for base in settings.bases:
-        inherited, further = _read_settings(module, ast.unparse(base))
-        described.append(inherited)
-        accepted += further
-    return "\n".join(filter(None, described)), accepted
+        inherited = _read_settings(module, ast.unparse(base))
+        described.append(inherited.text)
+        accepted += inherited.parameters
+    return _Described("\n".join(filter(None, described)), accepted)
 
 
 def _terminal_type(kind: Any) -> Any:
     """Return the type for the terminal, without what `Input` declares: `str | Path` becomes the
-    first of both, sequences become tuples, and names or None are listed in their order."""
+    first of both, and sequences become tuples."""
     if find_input(kind):
         kind = get_args(kind)[0]
     choices = get_args(kind)
-    if len(choices) == 2 and choices[1] is type(None) and get_origin(choices[0]) is Literal:
-        return Literal[(None, *get_args(choices[0]))]
     if Path in choices and str in choices:
         first = next(choice for choice in choices if choice in (Path, str))
         return first | None if type(None) in choices else first

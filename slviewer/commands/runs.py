@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from slviewer import terminal
 from slviewer.commands.command import (
@@ -196,48 +196,51 @@ def run_calibrate(calibrate: Function, arguments: Arguments) -> None:
     compare the models with --validate."""
     options, json_file = take_options(arguments, CalibrateOptions), arguments.pop("json")
     if options.camera_only:
-        if arguments["camera"] is not None:
-            raise UsageError(
-                "--camera is where the calibration of a rig starts, and --camera-only makes such a"
-                " file",
-                "omit one of them",
-            )
-        from slviewer.pipeline.calibrate import calibrate_camera_alone
-
-        chosen = {name: arguments[name] for name in ("target", "poses", "exclude")}
-        source, out = arguments["session"], options.out
-        result = call(calibrate_camera_alone, source=source, out=out, **chosen)
-    elif options.out is not None:
+        _calibrate_camera(arguments, options.out, json_file)
+        return
+    if options.out is not None:
         raise UsageError(
             "--out belongs to --camera-only",
             "`slviewer export calibration` writes the rig's calibration",
         )
-    else:
-        from slviewer.geometry.jit_prepare import Preparation
+    from slviewer.geometry.jit_prepare import Preparation
+    from slviewer.pipeline.accept import validate
+    from slviewer.pipeline.models import describe_default_model
 
-        with Preparation():
-            result = call(calibrate, **arguments)
+    with Preparation():
+        result = call(calibrate, **arguments)
     data = result.to_json()
-    if not options.camera_only:
-        terminal.print_result(_summarise_calibration(result))
-    if options.camera_only or options.verbose:
+    terminal.print_result(_summarise_calibration(result))
+    if options.verbose:
         terminal.print_result(result.text())
-    if options.camera_only and options.out is not None:
-        terminal.print_result(
-            f"written to {options.out}; next: slviewer calibrate SESSION --target"
-            f" {arguments['target']} --camera {options.out} [--fix-camera]"
-        )
-    if options.validate and not options.camera_only:
-        from slviewer.pipeline.accept import validate
-
+    if options.validate:
         compared = call(validate, session=arguments["session"], models=arguments["models"])
         data |= compared.to_json()
         terminal.print_result(compared.text())
-    if not options.camera_only:
-        from slviewer.pipeline.models import describe_default_model
-
-        terminal.print_result(describe_default_model(arguments["session"]))
+    terminal.print_result(describe_default_model(arguments["session"]))
     write_json(json_file, data)
+
+
+def _calibrate_camera(arguments: Arguments, out: Path | None, json_file: Path | None) -> None:
+    """Calibrate the camera alone, and print its figures, and where its file is."""
+    from slviewer.pipeline.calibrate import calibrate_camera_alone
+
+    if arguments["camera"] is not None:
+        raise UsageError(
+            "--camera is where the calibration of a rig starts, and --camera-only makes such a"
+            " file",
+            "omit one of them",
+        )
+    source, target = arguments["session"], arguments["target"]
+    chosen = {name: arguments[name] for name in ("poses", "exclude")}
+    result = call(calibrate_camera_alone, source=source, target=target, out=out, **chosen)
+    terminal.print_result(result.text())
+    if out is not None:
+        terminal.print_result(
+            f"written to {out}; next: slviewer calibrate SESSION --target {target} --camera {out}"
+            " [--fix-camera]"
+        )
+    write_json(json_file, result.to_json())
 
 
 def _summarise_calibration(found: Mapping[str, "ModelCalibration"]) -> str:
@@ -288,6 +291,17 @@ class SLStudioOptions:
 
     codec: Literal["2x3", "nstep", "3", "4", "gray"] | None = None
     axis: Literal["x", "y"] = "x"
+
+
+@dataclass(frozen=True)
+class CellOptions:
+    """How the code numbers the projector.
+
+    Args:
+        cell: Width of the cells that the Gray code numbers, px of the projector.
+    """
+
+    cell: int = 1
 
 
 @dataclass(frozen=True)
@@ -440,12 +454,14 @@ def make_import_command() -> Command:
             "Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code"
             " with inverses, white, black.\n\nA projector of 1024x768 pixels is assumed in a new"
             " session.",
+            "commands.runs:CellOptions",
         ),
         "opencv-graycode": _make_captures_command(
             "opencv-graycode",
             "Import the images of OpenCV's structured_light GrayCodePattern: columns, then rows,"
             " each bit with its inverse.\n\nImages are read in natural order of their names.",
             "commands.runs:FileOptions",
+            "commands.runs:CellOptions",
         ),
         "sltk": _make_captures_command(
             "sltk",
@@ -473,6 +489,7 @@ def make_import_command() -> Command:
             run=run_import_calibration,
         ),
         "cloud": read_command("pipeline.import_cloud:import_cloud", "files", options=JSON),
+        "poses": read_command("pipeline.machine_poses:import_poses", "file", options=JSON),
     }
 
     def import_command(command: Any) -> Work:
@@ -484,6 +501,8 @@ def make_import_command() -> Command:
             name, f"Import folders of the layout {name}, which a plugin reads."
         )
     import_command.__annotations__["command"] = union(layouts)
+    options = set().union(*(each.options for each in layouts.values()))  # type: ignore[attr-defined]
+    import_command.options = options  # type: ignore[attr-defined]
     return import_command
 
 
@@ -511,12 +530,12 @@ class Address:
 
 
 def wizard(
-    session: Positional[Path | None] = None,
+    serving: "Serving",
+    session: Path | None = None,
     rig: str = "",
-    address: Address = Address(),
     no_browser: bool = False,
     gpu: bool = False,
-) -> Work:
+) -> None:
     """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does
     the same.
 
@@ -525,18 +544,19 @@ def wizard(
             recent sessions, and makes new ones in the folder slviewer of your documents.
         rig: simulated (half resolution), simulated:0.25 or a driver; by default that of the
             session, else simulated.
-        address: Where and how to serve the page.
         no_browser: Print the address, and open no browser.
         gpu: Compute live scans on the CUDA device, once it has measured what the processor does.
     """
+    from slviewer.geometry.cuda_device import use_device
+    from slviewer.gui.app import run
 
-    def start() -> None:
-        """Run the wizard in the browser."""
-        from slviewer.geometry.cuda_device import use_device
-        from slviewer.gui.app import run
-        from slviewer.server.secure import Serving
+    use_device(gpu)
+    run(session, rig, serving, open_browser=not no_browser)
 
-        use_device(gpu)
-        run(session, rig, Serving(*vars(address).values()), open_browser=not no_browser)
 
-    return start
+def run_wizard(wizard: Function, arguments: Arguments) -> None:
+    """Start the wizard at the address that the options state."""
+    from slviewer.server.secure import Serving
+
+    address = take_options(arguments, Address)
+    wizard(Serving(*vars(address).values()), **arguments)

@@ -27,6 +27,7 @@ from slviewer.devices.protocols import (
     CameraSettings,
     Channel,
     check_channel,
+    check_image,
     check_index,
     check_level,
     check_sequence,
@@ -436,6 +437,15 @@ class BrowserProjector(PageDevice[ProjectorChannel]):
         page = self._pages.page()
         self._pages.set_light(level)
         page.request("level", grey=level)
+
+    def show_image(self, image: np.ndarray) -> None:
+        """Send an image (h, w, 3) and show it; a reloaded page is dark."""
+        self.check_open()
+        content = check_image(self, image).tobytes()
+        self._forget_loaded()
+        page = self._pages.page()
+        self._pages.set_light(0)
+        page.request("image", content, size=self.size)
 
     def _forget_loaded(self) -> None:
         """Forget the loaded sequence and the page that it was sent to."""

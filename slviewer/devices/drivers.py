@@ -1,8 +1,6 @@
 """Drivers by name: every file of this folder that holds a `DRIVER` is one, and plugins add
 others."""
 
-import importlib
-import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -10,7 +8,7 @@ from importlib.util import find_spec
 
 import slviewer.devices
 from slviewer.devices.protocols import Camera, Projector, Rig, Turntable
-from slviewer.entry_points import PluginGroup
+from slviewer.entry_points import PluginGroup, import_modules
 from slviewer.errors import DeviceError, InputError
 
 
@@ -57,12 +55,8 @@ def drivers() -> dict[str, Driver]:
 @cache
 def builtin_drivers() -> dict[str, Driver]:
     """Return the drivers of this folder by name."""
-    modules = (module.name for module in pkgutil.iter_modules(slviewer.devices.__path__))
-    candidates = (
-        getattr(importlib.import_module(f"slviewer.devices.{name}"), "DRIVER", None)
-        for name in modules
-    )
-    return {driver.name: driver for driver in candidates if isinstance(driver, Driver)}
+    modules = import_modules(slviewer.devices, "\nDRIVER = ")
+    return {module.DRIVER.name: module.DRIVER for module in modules}
 
 
 DRIVER_PLUGINS = PluginGroup("slviewer.drivers", Driver, builtin_drivers)

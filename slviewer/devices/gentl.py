@@ -63,7 +63,7 @@ def as_device_error(name: str) -> Iterator[None]:
         ) from error
 
 
-def producer_files(producer: str | None = None) -> list[str]:
+def producer_files(producer: str | None) -> list[str]:
     """List the .cti files to load: the given one, or all that are installed.
 
     Raises InputError where the given one is no such file, DeviceError where none is installed.
@@ -364,10 +364,8 @@ class Link:
             read_info(buffer, "width") or nodes.Width.value,
             read_info(buffer, "height") or nodes.Height.value,
         )
-        padding, offset = (
-            read_info(buffer, "padding_x") or 0,
-            read_info(buffer, "image_offset") or 0,
-        )
+        padding = read_info(buffer, "padding_x") or 0
+        offset = read_info(buffer, "image_offset") or 0
         if (read_info(buffer, "pixel_format") or self._format) != self._format:
             raise DeviceError(
                 f"{self.name} sends another pixel format than was set", "choose another one"

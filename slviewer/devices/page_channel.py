@@ -212,10 +212,8 @@ class PageChannel(ABC, Generic[Facts]):
                 is_same = first.window == before.window
                 if not is_same and not first.take:
                     return None
-                reloaded, replaced = (
-                    f"{self.name} was reloaded, or connected anew",
-                    f"another window was made {self.name}",
-                )
+                reloaded = f"{self.name} was reloaded, or connected anew"
+                replaced = f"another window was made {self.name}"
                 self._end_connection(before, reloaded if is_same else replaced)
                 before.send(None)
             page = self._page = PageConnection(

@@ -85,7 +85,7 @@ class PixelFormat:
         else:
             np.copyto(out.reshape(rows, used // 2), np.ascontiguousarray(lines).view("<u2"))
 
-    def view_samples(self, data: np.ndarray, size: Size, padding: int = 0) -> np.ndarray:
+    def view_samples(self, data: np.ndarray, size: Size, padding: int) -> np.ndarray:
         """Return a buffer's samples (h, w), or (h, w, samples), of `dtype`: a view where they need
         no unpacking."""
         width, height = size

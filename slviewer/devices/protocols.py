@@ -140,6 +140,12 @@ def preview_interval(camera: Camera) -> float:
     return float(getattr(camera, "preview_s", 0.0))
 
 
+def scene_state(camera: Camera) -> object:
+    """Return all that a camera's image depends on, apart from noise; None where its driver does not
+    know: the image may change at any time."""
+    return getattr(camera, "scene_state", None)
+
+
 _MAX_ANGLE_DEG = 1e5
 """What the controllers of turntables count exactly."""
 
@@ -206,6 +212,15 @@ class Projector(Protocol):
     def show_level(self, grey: int | None) -> None:
         """Show even light of grey level 0 ... 255, None for dark; returns when shown. The sequence
         stays loaded."""
+
+
+@runtime_checkable
+class ImageProjector(Projector, Protocol):
+    """A projector that can also show any image, pixel by pixel."""
+
+    def show_image(self, image: np.ndarray) -> None:
+        """Show an image (h, w, 3) uint8 RGB of the projector's size; returns when shown. The
+        sequence need not stay loaded. Raises InputError for an image of another size."""
 
 
 @dataclass(frozen=True)
@@ -505,6 +520,18 @@ def check_index(
     if not 0 <= index < len(sequence.frames):
         raise InputError(f"frame {index} of {len(sequence.frames)} does not exist", "count from 0")
     return sequence
+
+
+def check_image(projector: Projector, image: np.ndarray) -> np.ndarray:
+    """Return an image (h, w, 3) uint8 that fits the projector. Raises InputError for another."""
+    width, height = projector.size
+    if image.shape != (height, width, 3) or image.dtype != np.uint8:
+        raise InputError(
+            f"the image is {image.shape} {image.dtype}, and {projector.name} shows"
+            f" {(height, width, 3)} uint8",
+            "make it for this projector",
+        )
+    return image
 
 
 def check_level(grey: int | None) -> int:

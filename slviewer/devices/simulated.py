@@ -15,6 +15,7 @@ from slviewer.devices.protocols import (
     Openable,
     Rig,
     check_angle,
+    check_image,
     check_index,
     check_level,
     check_sequence,
@@ -71,6 +72,12 @@ class SimulatedCamera(CameraDriver):
         if frame is not out:
             cv2.resize(frame, self.size, dst=out, interpolation=cv2.INTER_LINEAR)
 
+    @property
+    def scene_state(self) -> object:
+        """What stands before the camera, how it is rendered and lit, and the camera's settings."""
+        shown = self.world.shown
+        return self.world.renderer(shown.preview), shown, self._settings
+
     def _read_settings(self) -> CameraSettings:
         return self._settings
 
@@ -126,9 +133,14 @@ class SimulatedProjector(Openable):
         self.check_open()
         self.show_pattern((None, np.full(self.size[0], check_level(grey), np.uint8)), preview=True)
 
+    def show_image(self, image: np.ndarray) -> None:
+        """Show an image (h, w, 3), of which a camera without colours sees the mean light."""
+        self.check_open()
+        self.show_pattern((None, check_image(self, image)), preview=True)
+
     def show_pattern(self, pattern: tuple[Axis | None, np.ndarray], preview: bool) -> None:
-        """Show a pattern as `fringe.patterns.profile` returns it, with the lamp's flicker and the
-        noise seed of this frame."""
+        """Show a pattern, as `Shown` has it, with the lamp's flicker and the noise seed of this
+        frame."""
         self._shows += 1
         rig = self.world.rig
         seed = (rig.seed, self._loads, self._shows, 0xDE)

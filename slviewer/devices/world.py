@@ -56,8 +56,8 @@ _DRAFT_SCALE = (
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What the projector shows: pattern as `fringe.patterns.profile` returns it, the lamp's
-    relative light, the noise's seed.
+    """What the projector shows: pattern as `fringe.patterns.profile` returns it, or no axis and an
+    image (h, w, 3) RGB, the lamp's relative light, the noise's seed.
 
     Under even light, `preview`, a moving scene may be drawn as a draft.
     """

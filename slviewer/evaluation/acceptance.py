@@ -46,12 +46,10 @@ from slviewer.records.record import from_plain, to_vector
 Kind = Literal["ball-bar", "sphere", "plane"]
 BALLS = {"ball-bar": 2, "sphere": 1, "plane": 0}
 K_95, K_997 = 1.96, 2.97
-FORM, SIZE, SPACING, FLATNESS = (
-    "probing error of form",
-    "probing error of size",
-    "sphere-spacing error",
-    "flatness",
-)
+FORM = "probing error of form"
+SIZE = "probing error of size"
+SPACING = "sphere-spacing error"
+FLATNESS = "flatness"
 LIMITS = {FORM: "form_mm", SIZE: "size_mm", SPACING: "spacing_mm", FLATNESS: "flatness_mm"}
 """Names of the operator's limits, mm, in the file; without one there is no decision."""
 POSITIONS = {"ball-bar": 7, "sphere": 7, "plane": 6}

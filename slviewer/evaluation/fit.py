@@ -11,6 +11,7 @@ code alone), the tolerances follow its expected noise.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Protocol, TypeVar
 
@@ -28,7 +29,14 @@ from slviewer.geometry.shapes import (
     ransac_plane,
     ransac_sphere,
 )
-from slviewer.geometry.vectors import finite_rows, patch_means, rms, subsample, unit_vectors
+from slviewer.geometry.vectors import (
+    finite_rows,
+    lengths,
+    patch_means,
+    rms,
+    subsample,
+    unit_vectors,
+)
 from slviewer.reconstruction.axis_agreement import RAISED_RATIO
 from slviewer.reconstruction.cloud import Cloud, Map, Points
 from slviewer.records.record import to_vector
@@ -36,9 +44,9 @@ from slviewer.records.verification import MAX_EXCLUDED, ModelFit, Shape, Verific
 
 MAX_SIGMA = 5.0
 LEAST_POINTS = 100
-RANSAC_TOLERANCE_MM = 1.0  # or twice the noise
-PATCH_TOLERANCE_MM = 3.0  # or six times the noise
-SPHERE_TOLERANCE = 0.04  # of its radius, if that is less
+RANSAC_TOLERANCE = 0.003  # of the field's diagonal, or twice the noise
+PATCH_TOLERANCE = 0.009  # or six times the noise
+SPHERE_TOLERANCE = 0.04  # of its radius, where that is known or less than the patch's
 RIM_PX = 2  # mixed pixels at an object's outline show neither the object nor what is behind it
 LEAST_PIXELS = 200
 _SAMPLE = 40_000
@@ -203,7 +211,11 @@ class ShapeSearch:
     def start(self, mask: Map) -> Plane | Sphere:
         """Estimate the shape that most points under ``mask`` agree with, by RANSAC."""
         measured = measured_pixels(self.points, mask)
-        tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * self._typical_noise(measured))
+        if self.radius is None:
+            tolerance = RANSAC_TOLERANCE * self._field_mm
+        else:
+            tolerance = SPHERE_TOLERANCE / 2 * self.radius
+        tolerance = max(tolerance, 2.0 * self._typical_noise(measured))
         some = _sample_points(self.points, measured)
         if self.shape == "plane":
             return ransac_plane(some, tolerance)[0]
@@ -224,9 +236,10 @@ class ShapeSearch:
         fitted = start or self.start(measured)
         patch, rim = np.zeros_like(measured), np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
         for _ in range(20):
-            before, reach = patch, PATCH_TOLERANCE_MM
+            before, reach = patch, PATCH_TOLERANCE * self._field_mm
             if isinstance(fitted, Sphere):
-                reach = min(reach, SPHERE_TOLERANCE * fitted.radius)
+                own = SPHERE_TOLERANCE * fitted.radius
+                reach = own if self.radius is not None else min(reach, own)
             distances = fitted.distance(np.where(measured[..., None], points, 0.0))
             agreeing = measured & (np.abs(distances) < max(reach, 6.0 * noise))
             patch = _largest_patch(agreeing)
@@ -289,6 +302,18 @@ class ShapeSearch:
             error_map,
             inliers,
         )
+
+    @cached_property
+    def _field_mm(self) -> float:
+        """Diagonal of what the image shows: that of the image, times the median step from pixel to
+        pixel."""
+        steps = [
+            lengths(np.diff(lines[:: max(1, len(lines) // 100)], axis=1))
+            for lines in (self.points, self.points.swapaxes(0, 1))
+        ]
+        known = np.concatenate([step[np.isfinite(step)] for step in steps])
+        step = float(np.median(known)) if known.size else 0.0
+        return step * float(np.hypot(*self.points.shape[:2]))
 
     def _typical_noise(self, measured: Map) -> float:
         """Median noise of the measured pixels in mm; 0 where none is known."""

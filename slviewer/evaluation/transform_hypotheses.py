@@ -18,6 +18,7 @@ from slviewer.evaluation.fit import evaluate_spheres, finite_or_none
 from slviewer.fringe.phase import PhaseMap, PhaseMaps
 from slviewer.geometry.rig import LARGEST_BASELINE_MM, StereoRig
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.triangulation import points_from_depth, triangulate
 from slviewer.geometry.vectors import lengths
 from slviewer.reconstruction.axis_agreement import (
@@ -120,9 +121,9 @@ def check_by_board(name: str, rig: StereoRig, points: Floats, measured: Floats) 
                 other.camera, other.projector, other.R, np.exp(log_scale) * other.t
             ).project(points)
             errors = np.nan_to_num((moved - measured)[known], nan=np.inf)
-            return float(1.4826 * np.median(np.abs(errors)))
+            return robust_sigma(errors, 0.0)
 
-        tried = np.log(SCALES[SCALES * np.linalg.norm(other.t) < LARGEST_BASELINE_MM])
+        tried = np.log(SCALES[SCALES * other.baseline_mm < LARGEST_BASELINE_MM])
         best = int(np.argmin([misfit(each) for each in tried]))
         ends = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
         found = minimize_scalar(misfit, bounds=ends, method="bounded", options={"xatol": 1e-5})
@@ -177,7 +178,9 @@ def _make_check(
     """Return the record of what the fits to a capture say."""
     answer, remedy = conclude_fits(fits)
     own = fits["as stated"]
-    misfits = {each: finite_or_none(fit.misfit) for each, fit in fits.items()}
+    misfits: dict[str, float | None] = {
+        each: finite_or_none(fit.misfit) for each, fit in fits.items()
+    }
     return TransformCheck(
         capture=name,
         answer=answer,
@@ -185,7 +188,7 @@ def _make_check(
         misfit=misfits.pop("as stated"),
         limit=own.limit,
         remedy=remedy,
-        others={each: misfit for each, misfit in misfits.items()},
+        others=misfits,
         scale=own.scale,
         depth_mm=depth_mm,
     )

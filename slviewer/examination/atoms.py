@@ -10,6 +10,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.examination import limits
 from slviewer.fringe.levels import find_common_range, longest_range
+from slviewer.fringe.patterns import evaluate_bit
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 
 
@@ -87,10 +88,7 @@ def evaluate_frame(
         return np.asarray(0.5 + 0.5 * np.cos(2 * np.pi * turns + sequence.offset_rad(axis)))
     half = frame.kind == "complementary"
     cells = (1 + half) * (u - sequence.origin_px(axis)) / sequence.gray_cell(axis)
-    code = np.floor(cells).astype(np.int64)
-    place = 0 if half else len(sequence.find("gray", axis)) - 1 - frame.bit
-    bit = ((code ^ (code >> 1)) >> place) & 1
-    return np.asarray(bit == (frame.kind != "inverse"), float)
+    return evaluate_bit(sequence, frame, np.floor(cells).astype(np.int64)).astype(float)
 
 
 def _find_range(sequence: PatternSequence, axis: Axis) -> tuple[float, float, float]:

@@ -1,6 +1,6 @@
 """Evaluation of hypotheses about a capture on its sample."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -8,10 +8,13 @@ from functools import cache, cached_property
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from slviewer.errors import InputError
 from slviewer.examination import limits
 from slviewer.examination.atoms import Atoms, tabulate_atoms
-from slviewer.examination.match import Match, match
+from slviewer.examination.match import Match, match, match_alone
 from slviewer.examination.sample import CaptureSample, Sample
+from slviewer.fringe.layout import axis_layout
+from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.records.verdict import Cause
 
@@ -95,6 +98,10 @@ class Evaluator:
             axis: sample.part(pixels or slice(sample.few))
             for axis, sample in self.sample.by_axis.items()
         }
+        return self.of_samples(by_axis)
+
+    def of_samples(self, by_axis: dict[Axis, Sample]) -> "Evaluator":
+        """Return the evaluator of other samples of the capture, with the same atoms."""
         return Evaluator(replace(self.sample, by_axis=by_axis), self._atoms)
 
     def atoms(self, hypothesis: Hypothesis, axis: Axis) -> Atoms:
@@ -112,12 +119,24 @@ class Evaluator:
         """Return the match of one axis; None where it has fewer than four images, or no pixels."""
         atoms, sample = self.atoms(hypothesis, axis), self.sample.by_axis.get(axis)
         images = tuple(hypothesis.images[i] for i in atoms.frames)
-        if sample is None or not sample.swing.size or len(images) - images.count(None) < 4:
+        if sample is None or not sample.swing.size or not _is_matchable(images):
             return None
         key = _list_conventions(hypothesis, axis), images
         if key not in self._matches:
             self._matches[key] = match(sample, atoms, list(images))
         return self._matches[key]
+
+    def leave_alone(self, hypothesis: Hypothesis, known: Collection[int | None]) -> np.ndarray:
+        """Return what a hypothesis leaves (p,) of the ``known`` images at pixels that are matched
+        alone; all of an axis of which it uses fewer than four of them."""
+        left = []
+        for axis, sample in self.sample.by_axis.items():
+            atoms = self.atoms(hypothesis, axis)
+            shown = (hypothesis.images[i] for i in atoms.frames)
+            images = [i if i in known else None for i in shown]
+            every = np.ones(len(sample.swing))
+            left.append(match_alone(sample, atoms, images) if _is_matchable(images) else every)
+        return np.concatenate(left)
 
     def matched(self, *hypotheses: Hypothesis) -> Iterator[tuple[Axis, Sample, Match]]:
         """Yield each axis that is matched, its sample, and its match under the one of the
@@ -127,13 +146,13 @@ class Evaluator:
             if (m := self.match(own, axis)) is not None:
                 yield axis, sample, m
 
-    def explained(self, hypothesis: Hypothesis) -> Iterator[tuple[Axis, Sample, Match, np.ndarray]]:
-        """Yield each axis of which enough pixels are explained: its sample, its match, and where
-        they are, (p,) bool."""
+    def explained(self, hypothesis: Hypothesis) -> Iterator[tuple[Axis, Sample, Match]]:
+        """Yield each axis of which enough pixels are explained, with the sample and the match of
+        these."""
         for axis, sample, m in self.matched(hypothesis):
             good = m.good(sample)
             if np.count_nonzero(good) >= limits.FEWEST_PIXELS:
-                yield axis, sample, m, good
+                yield axis, sample.part(good), m.part(good)
 
     def compare(self, base: Hypothesis, other: Hypothesis) -> "MisfitChange":
         """Compare a hypothesis with the ``base``, on the images that both use."""
@@ -181,6 +200,8 @@ class Evaluator:
         slopes, folded = list[np.ndarray](), list[Axis]()
         beyond: dict[Axis, tuple[np.ndarray, float]] = {}
         for axis, sample, m in self.matched(*hypotheses):
+            if _is_ambiguous(sequence, axis):
+                continue
             u = m.coordinate[m.misfit < limits.GOOD]
             if sequence.projector_size and u.size:
                 share = float(np.mean(u > sequence.extent(axis) + 0.5))
@@ -199,6 +220,23 @@ class Evaluator:
         if len(slopes) < 2:
             return Coordinates(None, beyond, [])
         return Coordinates(np.array(slopes), beyond, folded)
+
+
+def _is_matchable(images: Sequence[int | None]) -> bool:
+    """Return whether the images that are not missing suffice for a match."""
+    return len(images) - images.count(None) >= limits.FEWEST_IMAGES
+
+
+def _is_ambiguous(sequence: PatternSequence, axis: Axis) -> bool:
+    """Return whether the phase steps of an axis fit several places of the projector, so that they
+    state no coordinate of it; with unknown size, whether they have one period."""
+    try:
+        layout = axis_layout(sequence, axis)
+        if sequence.projector_size is None:
+            return len(layout.shifts) == 1 and not layout.gray
+        return unambiguous_px(layout) < layout.extent
+    except InputError:
+        return False
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,5 +281,5 @@ def _list_conventions(hypothesis: Hypothesis, axis: Axis) -> tuple[object, ...]:
         axis, hypothesis.motion_along(axis),
         tuple(sequence.frames[i] for i in sequence.select(axis)), sequence.projector_size,
         sequence.sign(axis), sequence.offset_rad(axis), sequence.origin_px(axis),
-        sequence.gray_cell(axis),
+        sequence.gray_cell(axis), sequence.binary,
     )  # fmt: skip

@@ -10,6 +10,7 @@ from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, Hypothesis, described, use_one_thread
 from slviewer.examination.explain import Explanation, explain, list_unresolved
 from slviewer.examination.findings import (
+    LINES,
     REMEDIES,
     contradict,
     describe_gamma,
@@ -58,8 +59,11 @@ def _judge(
     sequence, sample = base.sequence, evaluator.sample
     if not sample.is_usable and (sample.by_axis or sample.lit < limits.LEAST_LIT):
         return [describe_missing_pattern(sample)]
+    if too_few := [*_judge_few_periods(sequence)]:
+        return too_few
     ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
-    found, coordinates = explain(evaluator, base), [*_judge_coordinates(evaluator, base)]
+    found = explain(evaluator, base, bool(motion))
+    coordinates = [*_judge_coordinates(evaluator, base)]
     if found and not _is_imitated(found, evaluator, bool(ghost), bool(motion)):
         named = _describe_explanation(found, evaluator, base)
         # codes that cannot be are displaced as well
@@ -71,6 +75,21 @@ def _judge(
     if ghost:  # it imitates other light
         return [*judged, describe_ghost(ghost)]
     return [*judged, *(_judge_light(sequence, stack, light) if not coordinates else ())]
+
+
+def _judge_few_periods(sequence: PatternSequence) -> Iterator[Finding]:
+    """Yield the finding of an axis whose one fringe period does not number the projector: what fits
+    its images best is not known then."""
+    for axis in sequence.axes if sequence.projector_size else ():
+        is_single = len(sequence.periods_px(axis)) == 1 and not sequence.find("gray", axis)
+        error = contradict(sequence, axis) if is_single else None
+        if error is not None:
+            period, extent = sequence.period_px(axis), sequence.extent(axis)
+            text = (
+                f"{extent / period:.3g} fringes of {period:.4g} px do not number the projector's"
+                f" {extent} {LINES[axis]}"
+            )
+            yield Finding("projector-size", "rejected", text, error.remedy, axis=axis)
 
 
 def _is_imitated(found: Explanation, evaluator: Evaluator, ghost: bool, motion: bool) -> bool:

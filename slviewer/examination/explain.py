@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,24 +12,28 @@ from slviewer.examination.evaluate import Evaluator, Hypothesis, MisfitChange, d
 from slviewer.examination.hypotheses import (
     exchange,
     list_descriptions,
+    list_lags,
     list_motions,
     list_neighbours,
     list_orders,
     recover_orders,
 )
+from slviewer.examination.match import Match
 from slviewer.examination.motion import has_trend
-from slviewer.fringe.sequence import Indices, PatternSequence
+from slviewer.examination.sample import Sample
+from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.records.verdict import Cause
 
 Explanation = tuple[Hypothesis, ...]
 """One hypothesis, or one for each axis."""
 
 
-def explain(evaluator: Evaluator, base: Hypothesis) -> Explanation:
+def explain(evaluator: Evaluator, base: Hypothesis, has_motion: bool = False) -> Explanation:
     """Return what explains the images better than the description ``base``; empty where nothing
-    does, and where the description explains them well."""
+    does, and where the description explains them well, without motion of the scene, which phases of
+    another offset imitate."""
     found: Explanation = ()
-    if _is_doubtful(evaluator, base):
+    if has_motion or _is_doubtful(evaluator, base):
         found = _search(evaluator, base)
         # three steps of which two are alike fit a changed description as well
         if found and (found[0].axis or found[0].cause == "step-order"):
@@ -43,13 +48,20 @@ def explain(evaluator: Evaluator, base: Hypothesis) -> Explanation:
     return found or tuple(_explain_single_images(evaluator, base))
 
 
+def is_late(evaluator: Evaluator, base: Hypothesis) -> bool:
+    """Return whether the small sample shows that all frames are late, or early: the description
+    explains their light then as little as their order."""
+    lags = _rank(evaluator, base, list_lags(base.sequence))
+    return _choose_explaining(evaluator, base, lags) is not None
+
+
 def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
     """Return the frames of the finest Gray bits whose stripes the camera does not resolve."""
     sequence, out = base.sequence, list[int]()
-    for axis, sample, m, good in evaluator.explained(base):
+    for axis, sample, m in evaluator.explained(base):
         bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
-        patterns = evaluator.atoms(base, axis).at(m.coordinate[good])[m.places]
-        seen = (sample.levels[m.images, 1] - m.background)[:, good] / m.contrast[good].clip(1e-3)
+        patterns = evaluator.atoms(base, axis).at(m.coordinate)[m.places]
+        seen = (sample.levels[m.images, 1] - m.background) / m.contrast.clip(1e-3)
         pairs = [*zip(bits, inverse, strict=True)] if inverse else [(i,) for i in bits]
         for pair in reversed(pairs):
             places = [m.images.index(i) for i in pair]
@@ -58,10 +70,19 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
             contrasts = np.einsum("kp,kp->k", own, seen[places].clip(-1, 2)) / squares
             # blur leaves grey, and no image of even light or darkness
             uneven = np.abs(seen[places].mean(axis=1) - 0.5) > limits.FLAT
-            if (np.abs(contrasts) > limits.UNRESOLVED).any() or uneven.any():
+            is_seen = (np.abs(contrasts) > limits.UNRESOLVED).any() or uneven.any()
+            if is_seen and not _is_too_fine(sequence, axis, pair[0], sample, m):
                 break
             out += pair
     return out
+
+
+def _is_too_fine(sequence: PatternSequence, axis: Axis, k: int, sample: Sample, m: Match) -> bool:
+    """Return whether the stripes of frame k, a bit of the axis, are narrower than most pixels that
+    the match explains: what these show of them follows from no coordinate."""
+    finer = len(sequence.find("gray", axis)) - 1 - sequence.frames[k].bit
+    width = (2 - sequence.binary) * sequence.gray_cell(axis) * 2**finer
+    return width < float(np.median(np.abs(m.rise))) / sample.reach_px
 
 
 def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
@@ -99,48 +120,135 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
     ]
     if not rated:
         return ()
-    # one that accounts for all images, rather than one that leaves some out
+    for each in _list_likely(evaluator, rated, gained):
+        is_single = each.hypotheses[0].excluded is not None
+        if not is_single and _is_explained(evaluator, base, each, gained):
+            return _explain_by_one(evaluator, rated, each) or _locate(evaluator, rated, each)
+    return () if rated[0].hypotheses[0].excluded is None else _choose_strange(evaluator, rated)
+
+
+def _list_likely(
+    evaluator: Evaluator, rated: Sequence["_Rated"], gained: float
+) -> Sequence["_Rated"]:
+    """Return the best explanation, then those that account for all images about as well: one that
+    leaves none out is preferred. ``gained``: cost of the description's directions."""
     first, *others = rated
     most_left, k = first.most_left, first.hypotheses[0].excluded
     if k is not None:  # all images are compared, that one too
-        j = _identify_pattern(evaluator, first.hypotheses[0], k)
-        left = _measure_left(evaluator, first.hypotheses[0], k, j)
+        left, _ = _read_left_out(evaluator, first.hypotheses[0], k)
         most_left = min(most_left, float(left.mean()) + limits.LEFT_LEAST)
-    complete = [
+    return first, *(
         r
         for r in others
         if r.net + gained > limits.RIVAL * (first.net + gained)
         and r.comparison.left < most_left
         and not r.hypotheses[0].loses_images
-    ]
-    for each in (first, *complete):
-        is_single = each.hypotheses[0].excluded is not None
-        if not is_single and _is_explained(evaluator, base, each, gained):
-            return _locate(evaluator, rated, each)
-    return () if first.hypotheses[0].excluded is None else _choose_strange(evaluator, rated)
+    )
 
 
 def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
     """Compare all hypotheses on the small sample, and return the best of them, compared on all
     pixels."""
-    sequence = base.sequence
-    orders = _rank(evaluator, base, [*list_orders(sequence), *recover_orders(evaluator, sequence)])
-    pairs = _rank(evaluator, base, _list_pairs(evaluator, base, orders))
-    kept = sorted([*orders, *pairs], key=lambda ranked: -ranked[0])[: limits.KEPT]
-    rated = [_rate(evaluator, base, (h,)) for _, h in kept]
-    by_axis, moved = (
-        [
-            _rank(evaluator, base, list_all(sequence, axis))[: limits.KEPT // 2]
-            for axis in evaluator.sample.by_axis
-        ]
-        for list_all in (list_descriptions, list_motions)
-    )
+    kept, explaining = _rank_orders(evaluator, base)
+    rated = [_rate(evaluator, base, (h,)) for _, h in kept[: limits.KEPT]]
+    by_axis, moved = list[Sequence[_Ranked]](), list[Sequence[_Ranked]]()
+    for axis, sample in evaluator.sample.by_axis.items():
+        own, known = evaluator.of_samples({axis: sample}), explaining
+        for list_all, ranked in ((list_descriptions, by_axis), (list_motions, moved)):
+            every, known = _rank_likely(own, base, [*list_all(base.sequence, axis)], known)
+            ranked.append(every[: limits.KEPT // 2])
     rated += [_rate(evaluator, base, (h,)) for ranked in by_axis + moved for _, h in ranked]
     if len(by_axis) == 2:
         joint = [_rate(evaluator, base, (a, b)) for (_, a), (_, b) in product(*by_axis)]
         rated += [r for r in joint if r.comparison.sigmas > limits.SIGMAS]
     best = max(rated, key=lambda r: r.net).hypotheses[0]
     return rated + [_rate(evaluator, base, (h,)) for h in list_neighbours(best)]
+
+
+def _rank_orders(
+    evaluator: Evaluator, base: Hypothesis
+) -> tuple[Sequence["_Ranked"], Hypothesis | None]:
+    """Return the orders of the images and the exchanges of distant ones by what they gain on the
+    small sample, and the one that explains it; see `_rank_likely`."""
+    sequence = base.sequence
+    every = [*list_orders(sequence), *recover_orders(evaluator, sequence)]
+    first, others = _split_likely(evaluator, every)
+    orders = _rank(evaluator, base, first)
+    pairs = _rank(evaluator, base, _list_pairs(evaluator, base, orders))
+    explaining = _choose_explaining(evaluator, base, [*orders, *pairs])
+    orders += _rank(evaluator, base, _select_likely(evaluator, base, others, explaining))
+    if explaining is None:
+        orders.sort(key=lambda ranked: -ranked.net)
+        pairs = _rank(evaluator, base, _list_pairs(evaluator, base, orders))
+    return sorted([*orders, *pairs], key=lambda ranked: -ranked.net), explaining
+
+
+def _rank_likely(
+    evaluator: Evaluator,
+    base: Hypothesis,
+    hypotheses: Sequence[Hypothesis],
+    explaining: Hypothesis | None,
+) -> tuple[Sequence["_Ranked"], Hypothesis | None]:
+    """Return hypotheses by what they gain on the small sample, without those that are clearly less
+    likely than one that is known to explain it, if one is; and the one that explains it."""
+    ranked = list[_Ranked]()
+    if explaining is None:
+        first, hypotheses = _split_likely(evaluator, hypotheses)
+        ranked = _rank(evaluator, base, first)
+        explaining = _choose_explaining(evaluator, base, ranked)
+    ranked += _rank(evaluator, base, _select_likely(evaluator, base, hypotheses, explaining))
+    return sorted(ranked, key=lambda ranked: -ranked.net), explaining
+
+
+def _choose_explaining(
+    evaluator: Evaluator, base: Hypothesis, ranked: Sequence["_Ranked"]
+) -> Hypothesis | None:
+    """Return the best hypothesis if it explains the small sample as the description does that of a
+    sound capture; else None."""
+    if not ranked:
+        return None
+    best = max(ranked, key=lambda ranked: ranked.net).hypothesis
+    comparison = evaluator.coarse.compare(base, best)
+    most = min(limits.SMALL_LOSS, limits.LEFT_BY_EXPLAINING * comparison.loss)
+    return best if comparison.left < most else None
+
+
+def _split_likely(
+    evaluator: Evaluator, hypotheses: Sequence[Hypothesis]
+) -> tuple[Sequence[Hypothesis], Sequence[Hypothesis]]:
+    """Return the hypotheses that about fit best where each pixel is matched alone, and the
+    others."""
+    if not hypotheses:
+        return (), ()
+    alone = evaluator.part(slice(limits.ALONE))
+    left = np.array([alone.leave_alone(h, h.images) for h in hypotheses])
+    is_likely = ~_is_clearly_more(left - left[left.mean(axis=1).argmin()], limits.LEFT_LEAST)
+    chosen = [h for h, own in zip(hypotheses, is_likely, strict=True) if own]
+    return chosen, [h for h, own in zip(hypotheses, is_likely, strict=True) if not own]
+
+
+def _select_likely(
+    evaluator: Evaluator,
+    base: Hypothesis,
+    hypotheses: Sequence[Hypothesis],
+    explaining: Hypothesis | None,
+) -> Sequence[Hypothesis]:
+    """Return the hypotheses that may explain the images about as well as the one that does, all
+    without one: matched alone, pixels leave as little of the images that this one uses."""
+    if explaining is None or not hypotheses:
+        return hypotheses
+    alone, used = evaluator.part(slice(limits.ALONE)), explaining.images
+    left = np.array([alone.leave_alone(h, used) for h in hypotheses])
+    rated = _rate(evaluator.coarse, base, (explaining,))
+    most = rated.most_left - rated.comparison.left + rated.turned
+    is_likely = ~_is_clearly_more(left - alone.leave_alone(explaining, used), most)
+    return [h for h, own in zip(hypotheses, is_likely, strict=True) if own]
+
+
+def _is_clearly_more(values: np.ndarray, most: float) -> np.ndarray:
+    """Return whether the means of values (n, p) exceed a number by more than chance makes them."""
+    errors = limits.SIGMAS_OF_RIVAL * values.std(axis=1) / np.sqrt(values.shape[1])
+    return np.asarray(values.mean(axis=1) - errors > most)
 
 
 def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") -> Explanation:
@@ -164,6 +272,24 @@ def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") ->
         if h.cause == "frame-lag" and h.frames
     ]
     return (min(rivals, key=differ),)
+
+
+def _explain_by_one(
+    evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated"
+) -> Explanation:
+    """Return what explains all images better than the explanation that was found: that a single one
+    shows something else; empty where none does. What was rated leaves that image out."""
+    first = found.hypotheses[0]
+    few = first.changed if len(first.changed) <= limits.MOST_SINGLE else []
+    every, base = range(len(first.images)), described(first.sequence)
+    least, best = found.comparison.left - limits.LEFT_LEAST, None
+    excluded = (r.hypotheses[0].excluded for r in rated)
+    for k in {*few, *(i for i in excluded if i is not None)}:
+        others = replace(base, images=tuple(None if i == k else i for i in every))
+        left, shown = _read_left_out(evaluator, others, k)
+        if left.mean() < least:
+            least, best = float(left.mean()), shown
+    return () if best is None else (best,)
 
 
 @dataclass(frozen=True)
@@ -240,11 +366,28 @@ def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained:
     return len(rated.hypotheses) == 1 and bool(is_less)
 
 
+class _Ranked(NamedTuple):
+    """A hypothesis, and what it gains less its cost."""
+
+    net: float
+    hypothesis: Hypothesis
+
+
+class _Rival(NamedTuple):
+    """A frame that shows something else: ``is_late`` where that is an earlier pattern; its squared
+    ``residual``, and what the ``hypothesis`` leaves at each pixel, ``left`` (p,)."""
+
+    is_late: bool
+    residual: float
+    left: np.ndarray
+    hypothesis: Hypothesis
+
+
 def _choose_strange(evaluator: Evaluator, rated: Sequence[_Rated]) -> Explanation:
     """Return, of frames that show something else, the one that explains all images best, and of
     about equally likely ones one that repeats an earlier frame, else the one that fits least
     itself; empty where blur or the projector's response explains why it does not fit."""
-    rivals, best = list[tuple[bool, float, np.ndarray, Hypothesis]](), rated[0]
+    rivals, best = list[_Rival](), rated[0]
     for each in rated:
         first = each.hypotheses[0]
         k = first.excluded
@@ -253,26 +396,27 @@ def _choose_strange(evaluator: Evaluator, rated: Sequence[_Rated]) -> Explanatio
             residual = _measure_strangeness(evaluator, first, k)
             share = each.net / each.comparison.loss
             if residual > (0 if share > limits.STRANGE_SHARE else limits.VERY_STRANGE):
-                j = _identify_pattern(evaluator, first, k)
-                left = _measure_left(evaluator, first, k, j)
-                is_late = j is not None and j < k
-                rivals.append((is_late, residual, left, replace(first, frames=(k,), value=j)))
+                left, shown = _read_left_out(evaluator, first, k)
+                is_late = shown.value is not None and shown.value < k
+                rivals.append(_Rival(is_late, residual, left, shown))
     if not rivals:
         return ()
-    least = min((left for *_, left, _ in rivals), key=np.mean)
+    least = min((rival.left for rival in rivals), key=np.mean)
+    likely = []
+    for rival in rivals:
+        more = rival.left - least  # no more than chance makes it
+        if more.mean() <= limits.SIGMAS_OF_RIVAL * more.std() / np.sqrt(len(more)):
+            likely.append(rival)
+    return (max(likely, key=lambda rival: (rival.is_late, rival.residual)).hypothesis,)
 
-    def is_likely(left: np.ndarray) -> bool:
-        """Return whether a loss (p,) is the least one but for chance."""
-        more = left - least
-        return bool(more.mean() <= limits.SIGMAS_OF_RIVAL * more.std() / np.sqrt(len(more)))
 
-    likely = [rival for rival in rivals if is_likely(rival[2])]
-    found = max(likely, key=lambda rival: rival[:2])[3]
-    shown = found.value
-    cause: Cause = (
-        "frame-order" if shown is not None and shown > found.frames[0] else "duplicate-frame"
-    )
-    return (replace(found, cause=cause, images=()),)
+def _read_left_out(
+    evaluator: Evaluator, hypothesis: Hypothesis, k: int
+) -> tuple[np.ndarray, Hypothesis]:
+    """Return what is left of all images, as `_measure_left` does, where image k, which the
+    hypothesis leaves out, shows what it is most like, and the hypothesis that it shows that."""
+    j = _identify_pattern(evaluator, hypothesis, k)
+    return _measure_left(evaluator, hypothesis, k, j), _repeat(hypothesis.sequence, k, j)
 
 
 def _measure_left(
@@ -295,22 +439,37 @@ def _measure_left(
     return np.concatenate(losses)
 
 
-def _read_image(
-    evaluator: Evaluator, hypothesis: Hypothesis, k: int
-) -> tuple[Indices, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return what image k, which the hypothesis leaves out, shows at the pixels that the others
-    explain: (p,) relative to their dark and bright levels; before it the frames of its axis, and
-    behind it their patterns (k, p), and the changes (2, p) of image and pattern k from neighbour to
-    neighbour, which are known even where two places fit. None for too few pixels."""
-    for axis, sample, m, good in evaluator.explained(hypothesis):
+class _ReadImage(NamedTuple):
+    """What an image shows at p pixels: ``shown`` (p,), relative to their dark and bright levels.
+
+    ``patterns`` (k, p): of the k ``frames`` of its axis there. ``rise``, ``own_rise`` (p,): change
+    of the image and of its own pattern from neighbour to neighbour, which is known even where two
+    places fit.
+    """
+
+    frames: Indices
+    shown: np.ndarray
+    patterns: np.ndarray
+    rise: np.ndarray
+    own_rise: np.ndarray
+
+
+def _read_image(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> _ReadImage | None:
+    """Read image k, which the hypothesis leaves out, at the pixels that the others explain; None
+    for too few of them."""
+    for axis, sample, m in evaluator.explained(hypothesis):
         atoms = evaluator.atoms(hypothesis, axis)
         if k in atoms.frames:
-            levels, middle, half = sample.levels[k][:, good], m.coordinate[good], m.rise[good] / 2
-            shown = (levels[1] - m.background[good]) / m.contrast[good]
-            own = atoms.at(np.stack([middle - half, middle + half]).ravel())
-            first, second = own[atoms.frames.index(k)].reshape(2, -1)
-            steps = np.stack([(levels[2] - levels[0]) / m.contrast[good], second - first])
-            return tuple(atoms.frames), shown, atoms.at(middle), steps
+            before, own, behind = sample.levels[k]
+            ends = np.stack([m.coordinate - m.rise / 2, m.coordinate + m.rise / 2])
+            first, second = atoms.at(ends.ravel())[atoms.frames.index(k)].reshape(2, -1)
+            return _ReadImage(
+                tuple(atoms.frames),
+                (own - m.background) / m.contrast,
+                atoms.at(m.coordinate),
+                (behind - before) / m.contrast,
+                second - first,
+            )
     return None
 
 
@@ -326,11 +485,10 @@ def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> i
     out; None where it shows none."""
     if (read := _read_image(evaluator, hypothesis, k)) is None:
         return None
-    frames, shown, patterns, _ = read
-    residual = np.minimum((shown - patterns) ** 2, 1).mean(axis=1)
+    residual = np.minimum((read.shown - read.patterns) ** 2, 1).mean(axis=1)
     j = int(residual.argmin())
-    is_like = residual[j] < limits.UNLIKE_ANY_LEAST and patterns[j].std() > limits.FLAT / 2
-    return frames[j] if is_like and frames[j] != k else None
+    is_like = residual[j] < limits.UNLIKE_ANY_LEAST and read.patterns[j].std() > limits.FLAT / 2
+    return read.frames[j] if is_like and read.frames[j] != k else None
 
 
 def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> float:
@@ -338,11 +496,13 @@ def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -
     the contrast; 0 where it shows its pattern, or what blur leaves of stripes, and no other one."""
     if (read := _read_image(evaluator, hypothesis, k)) is None:
         return 0.0
-    frames, shown, patterns, steps = read
-    own = patterns[frames.index(k)]
-    alike = max(_correlate(shown, own), _correlate(*steps))
-    is_flat = np.mean(np.minimum((shown - 0.5) ** 2, 1)) < limits.FLAT**2
-    is_excused = hypothesis.sequence.frames[k].kind != "phase" and (is_flat or alike > limits.ALIKE)
+    shown, own = read.shown, read.patterns[read.frames.index(k)]
+    alike = max(_correlate(shown, own), _correlate(read.rise, read.own_rise))
+    kind = hypothesis.sequence.frames[k].kind
+    # white may be exposed otherwise
+    level = max(0.5, float(np.median(shown))) if kind in ("white", "texture") else 0.5
+    is_flat = np.mean(np.minimum((shown - level) ** 2, 1)) < limits.FLAT**2
+    is_excused = kind != "phase" and (is_flat or alike > limits.ALIKE)
     if is_excused and _identify_pattern(evaluator, hypothesis, k) is None:
         return 0.0
     residual = float(np.minimum((shown - own) ** 2, 1).mean())
@@ -374,9 +534,9 @@ def _explain_single_images(evaluator: Evaluator, base: Hypothesis) -> Iterator[H
         yield from (Hypothesis("duplicate-frame", sequence, (), (i,)) for i in strange)
 
 
-def _repeat(sequence: PatternSequence, i: int, j: int) -> Hypothesis:
-    """Return the hypothesis that image i shows the pattern of frame j."""
-    cause: Cause = "duplicate-frame" if j < i else "frame-order"
+def _repeat(sequence: PatternSequence, i: int, j: int | None) -> Hypothesis:
+    """Return the hypothesis that image i shows the pattern of frame j, or none of its axis."""
+    cause: Cause = "frame-order" if j is not None and j > i else "duplicate-frame"
     return Hypothesis(cause, sequence, (), (i,), value=j)
 
 
@@ -409,11 +569,9 @@ def _read_steps(evaluator: Evaluator, base: Hypothesis) -> tuple[dict[int, int],
     """Return the frame that each phase step or bit shows which does not show its own, and the steps
     that show none of their axis: blur makes bits unlike any."""
     shows, strange = dict[int, int](), list[int]()
-    for axis, sample, m, good in evaluator.explained(base):
-        groups = evaluator.atoms(base, axis).groups[m.places]
-        levels = sample.levels[m.images, 1][:, good]
-        shown = np.clip((levels - m.background[good]) / m.contrast[good], -1, 2)
-        own = m.predicted[:, good]
+    for axis, sample, m in evaluator.explained(base):
+        groups, own = evaluator.atoms(base, axis).groups[m.places], m.predicted
+        shown = np.clip((sample.levels[m.images, 1] - m.background) / m.contrast, -1, 2)
         squares = [np.einsum("kp,kp->k", a, a) for a in (shown, own)]
         residual = (squares[0][:, None] - 2 * shown @ own.T + squares[1]) / own.shape[1]
         for group in {*groups.tolist()}:
@@ -432,7 +590,7 @@ def _read_steps(evaluator: Evaluator, base: Hypothesis) -> tuple[dict[int, int],
 
 
 def _list_pairs(
-    evaluator: Evaluator, base: Hypothesis, orders: Sequence[tuple[float, Hypothesis]]
+    evaluator: Evaluator, base: Hypothesis, orders: Sequence["_Ranked"]
 ) -> Iterator[Hypothesis]:
     """Yield exchanges of distant frames, of those without which the others fit best, or that fit
     least themselves."""
@@ -447,7 +605,8 @@ def _list_pairs(
 
 def _rank(
     evaluator: Evaluator, base: Hypothesis, hypotheses: Iterable[Hypothesis]
-) -> list[tuple[float, Hypothesis]]:
+) -> list["_Ranked"]:
     """Return the hypotheses by what they gain on the small sample less their cost, best first."""
-    gains = [(evaluator.coarse.compare(base, h).gain - h.cost, h) for h in hypotheses]
-    return sorted(gains, key=lambda ranked: -ranked[0])
+    coarse = evaluator.coarse
+    gains = [_Ranked(coarse.compare(base, h).gain - h.cost, h) for h in hypotheses]
+    return sorted(gains, key=lambda ranked: -ranked.net)

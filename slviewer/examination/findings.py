@@ -17,6 +17,7 @@ from slviewer.fringe.layout import Layout, axis_layout
 from slviewer.fringe.levels import layout_levels
 from slviewer.fringe.origin import LATEST_TURNS
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.vectors import rms
 from slviewer.records.verdict import Cause, Finding, Severity
 
 LINES = {"x": "columns", "y": "rows"}
@@ -203,17 +204,8 @@ def _describe_convention(
             f"the fringes of axis {axis} shift in the opposite direction to the description",
             [(text, {"": sequence})],
         )
-    if cause == "bit-order" and sequence.find("gray", axis) != base.find("gray", axis):
-        return (
-            f"the Gray bits of axis {axis} and their inverses have changed places",
-            [("exchange gray and inverse frames in the description", {"": sequence})],
-        )
     if cause == "bit-order":
-        order = ", ".join(str(sequence.frames[i].bit) for i in base.bits("gray", axis))
-        return (
-            f"the Gray bits of axis {axis} do not have the described order",
-            [(f"number them {order} (0 is the most significant)", {"": sequence})],
-        )
+        return _describe_bits(sequence, base, axis)
     if cause == "gray-cell":
         period = base.period_px(axis)
         widths = [f"{cell / period:.3g}" for cell in (value, base.gray_cell(axis))]
@@ -238,6 +230,28 @@ def _describe_convention(
         f"the finest fringe period of axis {axis} is {value:.3g} px, and the description says"
         f" {described_px:.3g}",
         changes,
+    )
+
+
+def _describe_bits(
+    sequence: PatternSequence, base: PatternSequence, axis: Axis
+) -> tuple[str, list[_Change]]:
+    """Return observation and remedy of bits of another code, inverted, or in another order."""
+    if sequence.binary != base.binary:
+        codes = [("Gray code", "gray"), ("plain binary numbers", "binary")]
+        (is_shown, code), (is_described, _) = codes[sequence.binary], codes[base.binary]
+        remedy = f'describe the images in a TOML with code = "{code}", and `slviewer import frames`'
+        observation = f"the bits of axis {axis} are {is_shown}, not {is_described}"
+        return observation, [(remedy, {"": sequence})]
+    if sequence.find("gray", axis) != base.find("gray", axis):
+        return (
+            f"the Gray bits of axis {axis} and their inverses have changed places",
+            [("exchange gray and inverse frames in the description", {"": sequence})],
+        )
+    order = ", ".join(str(sequence.frames[i].bit) for i in base.bits("gray", axis))
+    return (
+        f"the Gray bits of axis {axis} do not have the described order",
+        [(f"number them {order} (0 is the most significant)", {"": sequence})],
     )
 
 
@@ -361,8 +375,9 @@ def describe_unreadable(axis: Axis, is_weak: bool) -> Finding:
 def describe_unresolved(sequence: PatternSequence, frames: Sequence[int]) -> Finding:
     """Return the finding of Gray bits, by their frames, whose stripes the camera does not
     resolve."""
-    names = sorted({f"{sequence.frames[i].bit} of {sequence.frames[i].axis}" for i in frames})
-    text = f"the camera does not resolve the stripes of Gray bit {', '.join(names)}"
+    bits = sorted({(str(f.axis), f.bit) for f in (sequence.frames[i] for i in frames)})
+    names = ", ".join(f"{bit} of {axis}" for axis, bit in bits)
+    text = f"the camera does not resolve the stripes of Gray bit {names}"
     return _find("blur", text, "doubtful", frames=tuple(frames))
 
 
@@ -386,11 +401,12 @@ def describe_ghost(share: float) -> Finding:
 
 
 def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Finding]:
-    """Yield a finding for each variation of the light that the operator should correct."""
-    used = [i for i, f in enumerate(sequence.frames) if f.kind != "texture"]
+    """Yield a finding for each variation of the light that the operator should correct, of gains
+    and room light the larger one first: a tone curve makes a lamp change the gains too."""
+    used = sequence.patterns
     gain = light.gain[used]
     span = float(gain.max() / gain.min()) - 1
-    wave = float(np.sqrt(np.mean(light.wave**2)))
+    wave = rms(light.wave)
     # of stripes motion is measured only where a bit and its inverse differ
     moving = "" if list_shifts(sequence) else ", or a scene that comes nearer or moves away"
     if "wave" in light.terms and wave > limits.REPORTED / 3:
@@ -400,13 +416,15 @@ def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Fin
             " which is corrected"
         )
         yield _find("flicker", text, "doubtful", frames=(used[0],))
+    found = list[tuple[float, Finding]]()
     if "gain" in light.terms and span > limits.REPORTED:
         text = (
             f"the brightness varies by {100 * span:.1f} % among frames of a kind (automatic"
             f" exposure, or an unsteady lamp{moving}), which is corrected"
         )
         frame = used[int(np.argmax(np.abs(np.log(gain))))]
-        yield _find("exposure-drift", text, "doubtful", frames=(frame,))
+        size = rms(np.log(gain))
+        found.append((size, _find("exposure-drift", text, "doubtful", frames=(frame,))))
     for k in light.changes if "room" in light.terms else ():
         change = float(light.room[k] - light.room[k - 1])
         text = (
@@ -417,7 +435,8 @@ def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Fin
             text += f"; between {steps} phase steps this cannot be corrected reliably"
         else:
             text += ", which is corrected"
-        yield _find("room-light", text, "doubtful", frames=(k,))
+        found.append((abs(change) / 2, _find("room-light", text, "doubtful", frames=(k,))))
+    yield from (each for _, each in sorted(found, key=lambda sized: -sized[0]))
 
 
 def describe_disturbance(terms: Sequence[Term]) -> Finding:

@@ -16,16 +16,16 @@ def measure_ghost(evaluator: Evaluator, base: Hypothesis) -> tuple[float, float]
     Each image's own light, light of the room, and displacement are fitted beside it.
     """
     normal, moment = 1e-9, 0.0
-    for axis, sample, m, good in evaluator.explained(base):
-        slope = evaluator.atoms(base, axis).slope_at(m.coordinate[good])[m.places]
-        A, B, d = m.background[good], m.contrast[good], m.predicted[:, good]
+    for axis, sample, m in evaluator.explained(base):
+        slope = evaluator.atoms(base, axis).slope_at(m.coordinate)[m.places]
+        A, B, d = m.background, m.contrast, m.predicted
         later = [k for k, i in enumerate(m.images) if i > 0]
         images = np.array(m.images)[later] - 1
-        before = (sample.levels[images, 1][:, good] - A) / B
+        before = (sample.levels[images, 1] - A) / B
         known = np.flatnonzero(np.isin(images, m.images))
         before[known] = d[[m.images.index(i) for i in images[known]]]
         own = np.stack([A / B + d, np.ones_like(d), slope])[:, later].astype(float)
-        both = np.stack([before - d[later], (m.residual(sample)[:, good] / B)[later]])
+        both = np.stack([before - d[later], (m.residual(sample) / B)[later]])
         squares, products = (np.einsum("akp,bkp->kab", own, each) for each in (own, both))
         fit = np.linalg.pinv(squares, 1e-8, hermitian=True) @ products
         x, r = both - np.einsum("kab,akp->bkp", fit, own)

@@ -27,11 +27,7 @@ def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
     """Yield the orders that cameras and projectors make: a lag, a lost image, an exchange of
     neighbours, a frame that shows something else, and other orders of few phase steps."""
     n = len(sequence.frames)
-    for lag in (1, 2, 3, -1):
-        images = [i + lag if 0 <= i + lag < n else None for i in range(n)]
-        hypothesis = _order("frame-lag", sequence, images, value=lag)
-        # what the lost images show is not explained
-        yield replace(hypothesis, cost=hypothesis.cost + LOST_COST * abs(lag))
+    yield from list_lags(sequence)
     kinds = [frame.kind for frame in sequence.frames]
     yield from (
         exchange(sequence, k, k + 1) for k in range(n - 1) if "texture" not in kinds[k : k + 2]
@@ -44,6 +40,16 @@ def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
         images = [None if i == k else i for i in range(n)]
         yield _order("duplicate-frame", sequence, images, (k,))
     yield from _permute_steps(sequence)
+
+
+def list_lags(sequence: PatternSequence) -> Iterator[Hypothesis]:
+    """Yield the orders of images that are all late, or early."""
+    n = len(sequence.frames)
+    for lag in (1, 2, 3, -1):
+        images = [i + lag if 0 <= i + lag < n else None for i in range(n)]
+        hypothesis = _order("frame-lag", sequence, images, value=lag)
+        # what the lost images show is not explained
+        yield replace(hypothesis, cost=hypothesis.cost + LOST_COST * abs(lag))
 
 
 def _permute_steps(sequence: PatternSequence) -> Iterator[Hypothesis]:
@@ -198,6 +204,9 @@ def list_descriptions(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothe
     for change_frame in changes:
         changed = change_frames(sequence, axis, change_frame)
         yield replace(described(changed), cause="bit-order", axis=axis, cost=CHANGE_COST)
+    if bits > 1:
+        other = described(replace(sequence, binary=not sequence.binary))
+        yield replace(other, cause="bit-order", axis=axis, cost=CHANGE_COST)
     for ratio in (0.5, 2.0) if bits else ():
         yield change("gray-cell", cell * ratio, gray_cell_px=cell * ratio)
     for turns in (0.25, 0.5, 0.75) if bits and shifts else ():

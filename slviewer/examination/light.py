@@ -9,11 +9,13 @@ selected, and nothing is corrected that the frames' means, or the match of the p
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, Hypothesis, described, use_one_thread
+from slviewer.examination.explain import is_late
 from slviewer.examination.frame_means import (
     evaluate_waves,
     measure_drift,
@@ -22,8 +24,10 @@ from slviewer.examination.frame_means import (
 )
 from slviewer.examination.sample import CaptureSample, Sample, sample_capture
 from slviewer.fringe.frame_light import FrameLight, Term, estimate_albedo, list_shifts
+from slviewer.fringe.image_area import ImageArea
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.vectors import rms
 
 MODELS: tuple[tuple[Term, ...], ...] = (
     ("room",), ("gain",), ("wave",), ("gain", "wave"), ("gain", "room")
@@ -55,6 +59,11 @@ class Look:
     evaluator: Evaluator
     light: FrameLight
 
+    @cached_property
+    def area(self) -> ImageArea:
+        """The part of the image that light changes between the frames."""
+        return ImageArea.of_frames(self.stack)
+
 
 def look_at(sequence: PatternSequence, stack: np.ndarray) -> Look:
     """Look at the frames (n, h, w) uint8 or uint16 of a capture.
@@ -79,11 +88,12 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
 
 def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) -> FrameLight:
     """Estimate the light of the frames (n, h, w) of a capture, described by ``base``, whose sample
-    an evaluator holds. One step of each term decides first whether there is any to estimate."""
+    an evaluator holds. One step of each term decides first whether there is any to estimate; of
+    frames that are all late there is none."""
     constant = FrameLight.constant(len(stack))
     fitted = evaluator.part(np.s_[::2])
     varying, rate = _list_varying(fitted, base), measure_drift(base.sequence, stack)
-    if not varying and not rate:
+    if (not varying and not rate) or is_late(evaluator, base):
         return constant
     judged = evaluator.part(np.s_[1::2])
     first = _measure_losses(judged, judged, base, constant)
@@ -105,7 +115,7 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
         is_large = _is_large(base.sequence, stack, light, terms[-1], own)
         if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
-    light = _accept(base.sequence, stack, best, score) if best.terms else constant
+    light = _accept(evaluator, base, stack, best, score)
     return drift if drift.terms and not light.terms else light
 
 
@@ -156,18 +166,50 @@ def _fit_from_means(evaluator: Evaluator, base: Hypothesis) -> tuple[FrameLight,
     return light, replace(light, gain=np.exp(logs))
 
 
+def _is_agreed(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> bool:
+    """Return whether parts of the image, each asked alone, agree on the gains of a light: light is
+    the same for all, and what a tone curve, blur and the scene imitate is not."""
+    if "gain" not in light.terms:
+        return True
+    parts = list[np.ndarray]()
+    for rows, columns in np.ndindex(2, 2):
+        by_axis = {}
+        for axis, sample in evaluator.sample.by_axis.items():
+            row, column = (sample.place > np.median(sample.place, axis=0)).T
+            by_axis[axis] = sample.part((row == rows) & (column == columns))
+        own = evaluator.of_samples(by_axis)
+        if residuals := [*_project(own, equalize_samples(own, base.sequence, light), base, light)]:
+            parts.append(_accumulate(residuals, light, ("gain",)).solve(("gain",))[0]["gain"])
+    known = np.count_nonzero(np.reshape(parts, (-1, len(light.gain))), axis=0) > 1
+    if not known.any():
+        return False
+    shifts, logs = list_shifts(base.sequence), np.log(light.gain)
+    coded = {*range(len(logs))}.difference(*shifts)
+    for kind in (*shifts, coded):
+        if alike := [k for k in kind if known[k]]:
+            logs[alike] -= logs[alike].mean()
+    squares = np.var([part[known] for part in parts], axis=0) / (len(parts) - 1)
+    # four values hardly tell a frame's own error
+    errors = np.sqrt((squares + squares.mean()) / 2 + limits.CONVERGED**2)
+    return bool(rms(logs[known] / errors) > limits.AGREED)
+
+
 def _accept(
-    sequence: PatternSequence, stack: np.ndarray, light: FrameLight, score: float
+    evaluator: Evaluator, base: Hypothesis, stack: np.ndarray, light: FrameLight, score: float
 ) -> FrameLight:
     """Return the light of best ``score`` if it is to be corrected; else equal light, with the terms
     of one that is neither refuted nor explains enough."""
+    sequence, samples = base.sequence, evaluator.sample.by_axis.values()
+    depth = np.mean([np.mean(each.swing / 2) / each.levels.mean() for each in samples])
     constant = FrameLight.constant(len(stack))
+    if not light.terms or not _is_agreed(evaluator, base, light):
+        return constant
     before, after, claimed = measure_unequal_means(sequence, stack, light)
     is_refuted = after > limits.REFUTED * before + limits.REFUTED_LEAST
     is_refuted |= claimed > 3 * before + limits.CONFIRMED_LEAST
     # means that differ anyway, of few fringes in view, refute nothing that explains much
     if score <= limits.EXPLAINED_CLEARLY:
-        is_refuted &= before < limits.CONFIRMED_LEAST
+        is_refuted &= (before < limits.CONFIRMED_LEAST) | (after > limits.DEEPEST * depth)
     is_strange = np.abs(np.log(light.gain)).max() > limits.FARTHEST_GAIN
     if is_strange or is_refuted.any():
         return constant
@@ -220,7 +262,7 @@ def equalize_samples(
         axis: replace(sample, levels=_equalize(sample, sequence, light))
         for axis, sample in evaluator.sample.by_axis.items()
     }
-    return replace(evaluator.part(np.s_[:]), sample=replace(evaluator.sample, by_axis=by_axis))
+    return evaluator.of_samples(by_axis)
 
 
 def _equalize(sample: Sample, sequence: PatternSequence, light: FrameLight) -> np.ndarray:
@@ -274,29 +316,30 @@ def _project(
         good &= m.contrast > limits.LEAST_CONTRAST * sample.swing
         if np.count_nonzero(good) < limits.FEWEST_PIXELS / 2:
             continue
-        atoms, frames, contrast = equal.atoms(base, axis), np.array(m.images), m.contrast[good]
+        sample, m = sample.part(good), m.part(good)
+        atoms, frames, contrast = equal.atoms(base, axis), np.array(m.images), m.contrast
         seen = evaluator.sample.by_axis[axis].levels[:, 1, good]
-        predicted = m.predicted[:, good]
-        level = m.background[good] / contrast + predicted
+        level = m.background / contrast + m.predicted
         # between stripes blur changes the levels, at the same phase of the fringes everywhere
-        beside = [atoms.at(m.coordinate[good] + d * m.rise[good])[m.places] for d in AROUND]
+        beside = [atoms.at(m.coordinate + d * m.rise)[m.places] for d in AROUND]
         is_edge, groups = np.ptp(beside, axis=0) > 0.5, atoms.groups[m.places]
         fuzzy = is_edge.mean(axis=1)
         used = 1 - (is_edge & (groups < 0)[:, None]).astype(np.float32)
         used[(groups < 0) & (fuzzy >= limits.FUZZY)] = limits.FUZZY_WEIGHT
         used[seen[frames] >= white] = 0
-        row, column = sample.place[good].T
+        row, column = sample.place.T
         over = np.ones_like(level) / light.gain[frames, None]
         albedo = over * estimate_albedo(sequence, seen, light.changes) / contrast
         shapes = {
             "gain": level, "uniform": over / contrast, "albedo": albedo, "rows": albedo * row,
             "columns": albedo * column, "level": np.ones_like(level),
-            "contrast": predicted - predicted.mean(axis=1, keepdims=True),
+            "contrast": m.predicted - m.predicted.mean(axis=1, keepdims=True),
+            "curve": m.predicted**2 * (groups >= 0)[:, None],
         }  # fmt: skip
-        slope = atoms.slope_at(m.coordinate[good])[m.places] + 1e-6
-        spans = np.stack([np.ones_like(level), predicted, slope]) * used
+        slope = atoms.slope_at(m.coordinate)[m.places] + 1e-6
+        spans = np.stack([np.ones_like(level), m.predicted, slope]) * used
         basis = np.linalg.qr(spans.transpose(2, 1, 0))[0].transpose(2, 1, 0)
-        left = _take_out(basis, (sample.levels[frames, 1][:, good] / contrast - level) * used)
+        left = _take_out(basis, (sample.levels[frames, 1] / contrast - level) * used)
         loss = np.einsum("kp,kp->p", left, left)
         weight = np.minimum(1, limits.OUTLIER * np.median(loss) / np.maximum(loss, 1e-12))
         yield _Residual(
@@ -336,15 +379,18 @@ class _Normal:
         """Indices of the frames that the sample shows."""
         return np.flatnonzero(self.level)
 
-    def solve(self, terms: Sequence[Term], change: int = 0) -> tuple[dict[str, np.ndarray], float]:
+    def solve(
+        self, terms: Sequence[Term], change: int = 0, *, imitated: bool = False
+    ) -> tuple[dict[str, np.ndarray], float]:
         """Return the change (n,) of each value, and the share of the residual that it removes.
 
         Beside the values of the terms, contrast and level of each period's steps, and the contrast
         of each other frame, are solved for. Gains are relative to the mean of their group, which
         contrast and level imitate, and 0 where the sample does not determine them. ``change``:
-        frame before which the room's light changes.
+        frame before which the room's light changes. ``imitated``: beside a tone curve, and what it
+        makes of blur, the level of other frames, which imitate gains.
         """
-        t, normal, moment, _ = self._reduce(terms, (change,))
+        t, normal, moment, _ = self._reduce(terms, (change,), imitated)
         x = np.linalg.solve(normal, moment)
         n = len(self.groups)
         step = (t @ x).reshape(len(self.values), n)
@@ -378,7 +424,7 @@ class _Normal:
         return out
 
     def _reduce(
-        self, terms: Sequence[Term], changes: Sequence[int]
+        self, terms: Sequence[Term], changes: Sequence[int], imitated: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return what q unknowns do to the values (v n, q), their normal equations (q, q) and (q,)
         with what is known of them before, and the frame before which the room's light changes (q,),
@@ -388,7 +434,8 @@ class _Normal:
         periods = [(self.groups == g).astype(float) for g in range(self.groups.max() + 1)]
         shared = np.stack([*periods, *each[other]], axis=1)
         blocks: dict[str, np.ndarray] = {
-            "contrast": shared, "level": shared[:, : len(periods)],
+            "contrast": shared, "level": shared if imitated else shared[:, : len(periods)],
+            **({"curve": np.ones((n, 1))} if imitated else {}),
             **{name: each for term in terms for name in VALUES[term]},
         }  # fmt: skip
         if "gain" in terms:
@@ -407,15 +454,20 @@ class _Normal:
             if name == "contrast":
                 blur = np.where(self.fuzzy[other] < limits.FUZZY, *limits.CONTRAST_PRIORS)
                 deviations[own][len(periods) :] = blur
+            if name == "level" and imitated:
+                deviations[own][len(periods) :] = 1e-3 + limits.FUZZY_LEVEL * self.fuzzy[other]
             of_room += changes if name in VALUES["room"] else [-1] * blocks[name].shape[1]
         normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
         return t, normal, t.T @ self.moment, np.array(of_room)
 
 
-def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[Term]) -> _Normal:
-    """Return the normal equations of the terms, and of contrast and level, about a light."""
+def _accumulate(
+    parts: Sequence[_Residual], light: FrameLight, terms: Sequence[Term], more: Sequence[str] = ()
+) -> _Normal:
+    """Return the normal equations of the terms, of contrast and level, and of ``more`` values,
+    about a light."""
     n = len(light.gain)
-    values = (*(name for term in terms for name in VALUES[term]), "contrast", "level")
+    values = (*(name for term in terms for name in VALUES[term]), "contrast", "level", *more)
     matrix, moment = np.zeros((len(values), n, len(values), n)), np.zeros((len(values), n))
     groups, (level, fuzzy) = np.full(n, -1), np.zeros((2, n))
     squares, entries = 1e-12, 0
@@ -452,12 +504,13 @@ def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Term]:
     if not parts:
         return set()
     light = replace(light, cycles=_find_wave(parts))
-    normal = _accumulate(parts, light, ("gain", "wave", "room"))
+    normal = _accumulate(parts, light, ("gain", "wave", "room"), ("curve",))
     before, count = normal.solve(())[1], len(normal.known)
+    imitated = normal.solve((), imitated=True)[1]
     shares: dict[Term, float] = {
-        "gain": normal.solve(("gain",))[1] - count / normal.entries,
+        "gain": normal.solve(("gain",))[1] + before - imitated - count / normal.entries,
         "wave": normal.solve(("wave",))[1] - 2 * count / normal.entries,
-        "room": max(normal.rate_changes(("room",)).values(), default=0.0),
+        "room": max(normal.rate_changes(("room",)).values(), default=0.0) + before - imitated,
     }
     return {term for term, share in shares.items() if share > before + limits.LIGHT_SHARE}
 
@@ -553,7 +606,7 @@ def _is_large(
     wave that leaves much; of few fringes in view they differ anyway."""
     if term == "wave":
         is_seen = left <= limits.EXPLAINED_WELL or shows_wave(sequence, stack, light)
-        return is_seen and float(np.sqrt(np.mean(light.wave**2))) > limits.LEAST_WAVE
+        return is_seen and rms(light.wave) > limits.LEAST_WAVE
     if term == "room":
         return float(np.ptp(light.room)) > limits.LEAST_ROOM
     logs = np.log(light.gain)

@@ -10,6 +10,8 @@ EVEN, PER_FRAME = 700, 40
 """Pixels chosen evenly, whose mean is known to 4 %, and at the edges of each frame."""
 COARSE = 6
 """A small sample, which ranks hypotheses, has this part of the pixels."""
+ALONE = 48
+"""Pixels that are matched alone, to leave hypotheses out before the small sample ranks them."""
 REACH_PX = 4
 """Distance of a neighbour: twice the blur of a camera in focus, less than the finest fringe."""
 VARIES = 1.5
@@ -24,6 +26,8 @@ FEW_FRAMES = 5
 largest and the second smallest differ by 0.56 of the range at least, of four by nothing."""
 OFTEN_CLIPPED = 0.1
 """Share of the frames in which a pixel is saturated, from which it is not used."""
+FEWEST_IMAGES = 4
+"""Three levels fit any three images."""
 FEWEST_PIXELS = 60
 """Below, the mean misfit of a sample is known to no better than 15 %."""
 LEAST_LIT = 0.005
@@ -78,6 +82,9 @@ EXPLAINED = 0.25
 """Share of the misfit that it must explain, or ..."""
 LEFT_OF_FRAMES = 0.6
 """... of the residual of the frames that it moves that may be left: noise is."""
+LEFT_BY_EXPLAINING = 0.25
+"""Share of the misfit that a hypothesis may leave beside which only those are tried that leave as
+little of pixels matched alone; measured, frames out of order leave 0.17 at most."""
 EXPLAINED_BY_MOTION = 0.05
 """The same of motion, to which the projector's response and blur leave much: measured, motion
 explains nothing of sound captures."""
@@ -178,6 +185,8 @@ stripes, which blur imitates and thresholds tolerate: alone, and beside fringes,
 it."""
 REPORTED = 0.03
 """Variation of the brightness, from the darkest to the brightest frame, that is reported."""
+AGREED = 1.8
+"""Standard errors, by the scatter of parts of the image, that gains must vary by."""
 FARTHEST_GAIN = 0.7
 """Logarithm of a gain over the median of its kind beyond which a frame shows something else."""
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
@@ -194,6 +203,9 @@ FEW_FRAMES_KNOWN = 3
 """Frames on either side of a change of the room's light: one or two may just be of other gain."""
 REFUTED, REFUTED_LEAST = 1.5, 0.004
 """Factor, and share of the brightness, by which a correction may worsen the equality of means."""
+DEEPEST = 0.75
+"""Variation of means under the light that is corrected, over the depth of the patterns: a cosine
+has 0.71."""
 CONFIRMED, CONFIRMED_LEAST = 0.65, 0.01
 """Factor by which a correction improves it that is accepted although blur or the projector's
 response leave residuals; and variation that is not a matter of too few fringes in view."""
@@ -212,6 +224,9 @@ FUZZY = 0.4
 """Share of the pixels at a stripe's edge, from which blur may have changed its contrast."""
 FUZZY_WEIGHT = 0.2
 """Weight of their levels: blur changes them by up to a third of the contrast."""
+FUZZY_LEVEL = 1.0
+"""Uncertainty of the level of stripes whose every pixel is at an edge, of the contrast: a tone
+curve makes light out of blur."""
 CONTRAST_PRIORS = 0.1, 0.5
 """Uncertainty of the contrast of a frame's stripes: wide ones scatter light, and blur takes all of
 it from fine ones."""

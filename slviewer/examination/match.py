@@ -6,14 +6,17 @@ largest correlation is the most likely one for equal noise in all frames (Mirdeh
 two neighbours: that counts wrong patterns, and patterns that do not join, alike.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from slviewer.examination import limits
 from slviewer.examination.atoms import Atoms
 from slviewer.examination.sample import Sample
+from slviewer.geometry.jit import kernel
+
+_OF_PIXELS = ("coordinate", "rise", "background", "contrast", "misfit")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +43,14 @@ class Match:
     def jump(self) -> np.ndarray:
         """(p,) px between the neighbours' coordinates."""
         return np.abs(self.rise)
+
+    def part(self, pixels: np.ndarray) -> "Match":
+        """Return the match of some of the pixels."""
+        return replace(
+            self,
+            predicted=self.predicted[:, pixels],
+            **{name: getattr(self, name)[pixels] for name in _OF_PIXELS},
+        )
 
     def residual(self, sample: Sample) -> np.ndarray:
         """(k, p) grey levels that the prediction does not explain."""
@@ -84,6 +95,18 @@ def match(sample: Sample, atoms: Atoms, images: list[int | None]) -> Match:
         predicted = _fit_groups(seen, pattern, background, contrast, misfit, groups)
         misfit, background, contrast = _fit_levels(seen, predicted)
     return Match(there, places, atoms, middle, rise, predicted, background, contrast, misfit)
+
+
+def match_alone(sample: Sample, atoms: Atoms, images: Sequence[int | None]) -> np.ndarray:
+    """Return the share (p,) of the variance that is left of pixels each of which is matched alone,
+    wherever its neighbours are: less than `match` leaves, and known much sooner."""
+    places = [place for place, image in enumerate(images) if image is not None]
+    there = [image for image in images if image is not None]
+    values, seen = atoms.values[places], sample.levels[there, 1]
+    for each in (values, seen):  # copies
+        each -= each.mean(axis=0)
+        each /= np.maximum(np.sqrt(np.einsum("kp,kp->p", each, each)), 1e-3)
+    return np.asarray(1 - np.maximum((seen.T @ values).max(axis=1), 0) ** 2)
 
 
 def _blur_stripes(
@@ -169,36 +192,49 @@ def _join(scores: np.ndarray, length: np.ndarray, undecided: float) -> np.ndarra
     rise = best[1] - best[0]
     window = np.hanning(2 * limits.NEAR + 3)
     counts = np.convolve(np.bincount(rise - rise.min()), window)[limits.NEAR + 1 :]
-    joined, least, most = best, np.inf, counts.max()
+    usual, most = list[int](), counts.max()
     while counts.max() > limits.FREQUENT * most:
         k = int(counts.argmax())
         counts[max(k - limits.NEAR, 0) : k + limits.NEAR + 1] = 0
-        usual = k + int(rise.min())
-        far = np.flatnonzero(np.abs(rise - usual) > limits.NEAR)
-        if not far.size:
+        usual.append(k + int(rise.min()))
+        if (np.abs(rise - usual[-1]) <= limits.NEAR).all():
             return best
-        pairs, losses = _pair(scores[:, far], length[:, far], usual)
-        loss = float(np.minimum(losses, undecided).sum())
-        if loss < least:
-            accepted, least, joined = losses < undecided, loss, best.copy()
-            joined[:, far[accepted]] = pairs[:, accepted]
-    return joined
+    pairs, losses = _pair(scores, length, best, np.array(usual), undecided)
+    return pairs[losses.sum(axis=1).argmin()]
 
 
-def _pair(scores: np.ndarray, length: np.ndarray, usual: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places (2, p) at about the usual distance that fit two neighbours best, and the
-    loss (p,) of their correlations against the best ones; see `_join`."""
-    relative = scores / np.maximum(length[:, :, None], 1e-6)
-    size = scores.shape[2]
-    near = np.arange(-limits.NEAR, limits.NEAR + 1) + usual
-    beside = np.clip(np.arange(size) + usual, 0, size - 1)
-    highest = cv2.dilate(relative[1], np.ones((1, len(near)), np.uint8))[:, beside]
-    first = (relative[0] + highest).argmax(axis=1)
-    around = np.clip(first[:, None] + near, 0, size - 1)
-    rows = np.arange(len(first))
-    second = around[rows, np.take_along_axis(relative[1], around, axis=1).argmax(axis=1)]
-    loss = relative.max(axis=2) - [relative[0, rows, first], relative[1, rows, second]]
-    return np.stack([first, second]), loss.sum(axis=0)
+@kernel()
+def _pair(
+    scores: np.ndarray, length: np.ndarray, best: np.ndarray, usual: np.ndarray, most: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each of m ``usual`` distances, the places (m, 2, p) at about it that fit both
+    neighbours best, and the loss (m, p) of their correlations against the ``best`` ones; those with
+    their loss of ``most`` where it is not less, and without loss where these are at the distance;
+    see `_join`."""
+    count, size = scores.shape[1:]
+    pairs, losses = np.empty((len(usual), *best.shape), best.dtype), np.empty((len(usual), count))
+    first, loss = np.empty(size, best.dtype), np.empty(size)
+    for p in range(count):
+        a, b = 1 / max(length[0, p], 1e-6), 1 / max(length[1, p], 1e-6)
+        high_a, high_b = scores[0, p, best[0, p]] * a, scores[1, p, best[1, p]] * b
+        candidates = 0
+        for place in range(size):
+            if high_a - scores[0, p, place] * a < most:
+                first[candidates], loss[candidates] = place, high_a - scores[0, p, place] * a
+                candidates += 1
+        for k in range(len(usual)):
+            pairs[k, :, p] = best[:, p]
+            is_near = abs(best[1, p] - best[0, p] - usual[k]) <= limits.NEAR
+            losses[k, p] = 0.0 if is_near else most
+            for c in range(candidates):
+                if loss[c] >= losses[k, p]:
+                    continue
+                low, high = first[c] + usual[k] - limits.NEAR, first[c] + usual[k] + limits.NEAR
+                for second in range(min(max(low, 0), size - 1), min(max(high, 0), size - 1) + 1):
+                    both = loss[c] + high_b - scores[1, p, second] * b
+                    if both < losses[k, p]:
+                        losses[k, p], pairs[k, 0, p], pairs[k, 1, p] = both, first[c], second
+    return pairs, losses
 
 
 def _refine(scores: np.ndarray, best: np.ndarray) -> np.ndarray:

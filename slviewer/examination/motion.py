@@ -51,12 +51,12 @@ def has_trend(evaluator: Evaluator, base: Hypothesis) -> bool:
 
     It shows between the stripes and few steps, whose mean the coordinate takes up.
     """
-    for axis, sample, m, good in evaluator.explained(base):
-        slope = m.atoms.slope_at(m.coordinate[good])[m.places]
+    for axis, sample, m in evaluator.explained(base):
+        slope = m.atoms.slope_at(m.coordinate)[m.places]
         time = np.array(m.images) / max(np.ptp(m.images), 1)
         trend = slope * time[:, None]
-        left = m.residual(sample)[:, good] / m.contrast[good]
-        spans = [np.ones_like(slope), m.predicted[:, good], slope]
+        left = m.residual(sample) / m.contrast
+        spans = [np.ones_like(slope), m.predicted, slope]
         for i, basis in enumerate(spans):
             squares = np.maximum(np.einsum("kp,kp->p", basis, basis), 1e-6)
             for each in (*spans[i + 1 :], trend, left):
@@ -144,10 +144,10 @@ def _measure_steps(evaluator: Evaluator, base: Hypothesis) -> Iterator[tuple[Axi
     The coordinate that predicts a pixel is the mean over its steps; each step is displaced from it
     by residual / slope, beside light of its own.
     """
-    for axis, sample, m, good in evaluator.explained(base):
+    for axis, sample, m in evaluator.explained(base):
         atoms = evaluator.atoms(base, axis)
         steps = np.flatnonzero(atoms.groups[m.places] >= 0)
-        slope = atoms.slope_at(m.coordinate[good])[m.places]
+        slope = atoms.slope_at(m.coordinate)[m.places]
         kinds = [base.sequence.frames[i] for i in m.images]
         if not steps.size and base.sequence.find("inverse", axis):
             steps = np.flatnonzero(np.count_nonzero(slope, axis=1) >= limits.FEWEST_AT_EDGES)
@@ -155,10 +155,9 @@ def _measure_steps(evaluator: Evaluator, base: Hypothesis) -> Iterator[tuple[Axi
             continue
         images = np.array(m.images)[steps]
         steps = steps[order := np.argsort(images)]
-        residual = (m.residual(sample)[:, good] / m.contrast[good])[steps]
-        slope = slope[steps]
+        residual, slope = (m.residual(sample) / m.contrast)[steps], slope[steps]
         if atoms.groups.max() < 0:
-            predicted = m.predicted[:, good][steps]
+            predicted = m.predicted[steps]
             residual, slope = (_remove_levels(each, predicted) for each in (residual, slope))
         squares, moment, whole = (
             np.einsum("kp,kp->k", a, b)

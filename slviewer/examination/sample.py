@@ -18,7 +18,7 @@ class Sample:
     behind it, along the direction of the image in which the axis varies. ``place`` (p, 2): row and
     column as shares of the image, -0.5 to 0.5. ``swing`` (p,): range of levels over the frames.
     ``direction``: index of the direction in ``place``. The first ``few`` pixels are a small sample
-    of all.
+    of all. ``reach_px``: distance between the two neighbours of a pixel.
     """
 
     levels: np.ndarray
@@ -26,6 +26,7 @@ class Sample:
     swing: np.ndarray
     direction: int
     few: int
+    reach_px: int
 
     def part(self, pixels: slice | np.ndarray) -> "Sample":
         """Return the sample of some pixels."""
@@ -98,7 +99,7 @@ def sample_capture(sequence: PatternSequence, stack: np.ndarray) -> CaptureSampl
         chosen = np.flatnonzero(usable)[chosen]
         by_axis[axis] = Sample(
             cross[:, order][:, :, chosen], place.reshape(-1, 2)[chosen], swing[chosen],
-            order[0] // 2 ^ 1, few,
+            order[0] // 2 ^ 1, few, 2 * reach,
         )  # fmt: skip
     shares = float(lit[0].mean()), float(often.mean())
     return CaptureSample(by_axis, *shares, noise, float(np.median(swing)), white)

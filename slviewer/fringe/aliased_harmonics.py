@@ -13,6 +13,7 @@ relief, and serve as a control.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from slviewer.fringe import limits
 from slviewer.fringe.cosines import fit_cosine, select_rows
 from slviewer.fringe.layout import Layout
 from slviewer.fringe.phase import Noise
+from slviewer.geometry.robust import robust_sigma
 
 MOST_STEPS = 4
 """From five steps on, harmonics below the fourth cause no error, and blur removes most of the
@@ -207,12 +209,27 @@ def _sample_lines(
     return phasor, background, valid, float(np.median(np.abs(turn))) / (2 * np.pi)
 
 
-def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] | None:
-    """Fit the ripple's amplitudes M and d; None for too few pieces.
+class _Mean(NamedTuple):
+    """A mean, its standard error, and the standard deviation of the means of blocks of the image;
+    NaN where there are too few."""
 
-    Third, the standard deviation of d over the image; fourth, the phase ripple that remains at the
-    double frequency.
-    """
+    value: float = np.nan
+    error: float = np.nan
+    spread: float = np.nan
+
+
+class _Ripple(NamedTuple):
+    """The amplitudes ``M`` of the modulation's and ``d`` of the phase's ripple, the ``spread`` of d
+    over the image, and what remains of the phase's at the double frequency, ``second``."""
+
+    M: _Amplitude
+    d: _Amplitude
+    spread: float
+    second: float
+
+
+def _fit_ripple(pieces: _Pieces) -> _Ripple | None:
+    """Fit the ripple; None for too few pieces."""
     M = d = 0.0
     n, size = pieces.steps, pieces.theta.shape[1]
     x = np.broadcast_to(np.linspace(-1, 1, size), pieces.theta.shape)
@@ -239,46 +256,41 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
             )
             for row, column in ((3, 0), (4, 0), (6, 0), (3, 1), (4, 1))
         )
-        if not np.isfinite([phase_sine[0], modulation_cosine[0]]).all():
+        if not np.isfinite([phase_sine.value, modulation_cosine.value]).all():
             return None
-        limit, before = 0.9 / n, (M, d)
-        M, d = (
-            float(np.clip(modulation_cosine[0], -0.9, 0.9)),
-            float(np.clip(d - phase_sine[0], -limit, limit)),
-        )
+        limit, old_M, old_d = 0.9 / n, M, d
+        M = float(np.clip(modulation_cosine.value, -0.9, 0.9))
+        d = float(np.clip(d - phase_sine.value, -limit, limit))
         if (
-            abs(M - before[0]) <= SETTLED * modulation_cosine[1]
-            and abs(d - before[1]) <= SETTLED * phase_sine[1]
+            abs(M - old_M) <= SETTLED * modulation_cosine.error
+            and abs(d - old_d) <= SETTLED * phase_sine.error
         ):
             break
-    return (
-        _Amplitude(M, modulation_cosine[1], modulation_sine[0]),
-        _Amplitude(d, phase_sine[1], phase_cosine[0]),
-        phase_sine[2],
-        second[0],
+    return _Ripple(
+        _Amplitude(M, modulation_cosine.error, modulation_sine.value),
+        _Amplitude(d, phase_sine.error, phase_cosine.value),
+        phase_sine.spread,
+        second.value,
     )
 
 
-def _compute_robust_mean(
-    values: np.ndarray, weights: np.ndarray, block: np.ndarray
-) -> tuple[float, float, float]:
-    """Return weighted mean without outliers, its standard error, and standard deviation of the
-    blocks' means."""
+def _compute_robust_mean(values: np.ndarray, weights: np.ndarray, block: np.ndarray) -> _Mean:
+    """Return the weighted mean without outliers."""
     if len(values) == 0:
-        return np.nan, np.nan, np.nan
+        return _Mean()
     middle = np.median(values)
-    is_inlier = np.abs(values - middle) <= OUTLIER * 1.4826 * np.median(np.abs(values - middle))
+    is_inlier = np.abs(values - middle) <= OUTLIER * robust_sigma(values, middle)
     values, weights, block = values[is_inlier], weights[is_inlier], block[is_inlier]
     total = np.bincount(block, weights)
     used = total > 0
     if np.count_nonzero(used) < FEWEST_BLOCKS:
-        return np.nan, np.nan, np.nan
+        return _Mean()
     total, means = total[used], np.bincount(block, weights * values)[used] / total[used]
     share = total / total.sum()
     mean = float(share @ means)
     many = 1 - float(share @ share)
     spread = float(np.sqrt(share @ (means - mean) ** 2 / max(many, 0.1)))
-    return mean, spread * float(np.sqrt(share @ share)), spread
+    return _Mean(mean, spread * float(np.sqrt(share @ share)), spread)
 
 
 def _compute_correction(theta: np.ndarray, n: int, M: float, d: float) -> np.ndarray:

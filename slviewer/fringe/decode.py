@@ -143,6 +143,7 @@ def _pack_gray_rules(layout: Layout) -> kernels_gray.GrayRules:
         layout.gray_cell_px,
         layout.extent - 0.5,
         np.sqrt(0.5 if layout.inverse else 1.5),
+        layout.binary,
     )
 
 

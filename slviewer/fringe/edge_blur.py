@@ -77,7 +77,7 @@ class EdgeDisplacement:
         )
 
 
-def estimate_camera_blur(modulation: Floats32, mask: Mask, noise: float = 0.0) -> Floats32:
+def estimate_camera_blur(modulation: Floats32, mask: Mask, noise: float) -> Floats32:
     """Estimate the standard deviation, px, of the camera's point spread: (rows, columns) of `TILES`
     float32.
 
@@ -120,9 +120,7 @@ def estimate_camera_blur(modulation: Floats32, mask: Mask, noise: float = 0.0) -
     return blur
 
 
-def estimate_displacement(
-    phase: Floats32, modulation: Floats32, noise: float = 0.0
-) -> EdgeDisplacement:
+def estimate_displacement(phase: Floats32, modulation: Floats32, noise: float) -> EdgeDisplacement:
     """Estimate the displacement of the ``phase`` (h, w) rad by the camera's blur.
 
     ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy edges
@@ -241,16 +239,12 @@ def _displace(first, last, modulation, phase, sigma, noise, shift, is_continuous
             shift[v, u] = size if found > 0 else -size
             beyond = _beyond_blur(sigma[v, u])
             if abs(slope_u) >= abs(slope_v):
-                one, other = (
-                    modulation[v, max(u - beyond, 0)],
-                    modulation[v, min(u + beyond, width - 1)],
-                )
+                one = modulation[v, max(u - beyond, 0)]
+                other = modulation[v, min(u + beyond, width - 1)]
                 is_continuous[v, u] = _continues(phase, modulation, noise, v, u, 0, beyond)
             else:
-                one, other = (
-                    modulation[max(v - beyond, 0), u],
-                    modulation[min(v + beyond, height - 1), u],
-                )
+                one = modulation[max(v - beyond, 0), u]
+                other = modulation[min(v + beyond, height - 1), u]
                 is_continuous[v, u] = _continues(phase, modulation, noise, v, u, beyond, 0)
             dark, bright = min(one, other), max(one, other)
             place = (here - dark) / max(bright - dark, noise)

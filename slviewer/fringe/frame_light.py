@@ -128,7 +128,7 @@ def equalize_frames(
 
 
 def estimate_albedo(
-    sequence: PatternSequence, frames: np.ndarray, changes: Sequence[int] = ()
+    sequence: PatternSequence, frames: np.ndarray, changes: Sequence[int]
 ) -> np.ndarray:
     """Return half of the projector's light in grey levels, float32 of the shape of one of the
     ``frames`` (n, ...).
@@ -150,8 +150,7 @@ def estimate_albedo(
         differences = reduce(np.maximum, (cv2.absdiff(frames[i], frames[j]) for i, j in pairs))
         # OpenCV makes columns of vectors
         return np.float32(0.5) * differences.reshape(frames.shape[1:])
-    coded = [i for i, frame in enumerate(sequence.frames) if frame.kind != "texture"]
-    runs = np.split(np.array(coded), np.searchsorted(coded, changes))
+    runs = np.split(sequence.patterns, np.searchsorted(sequence.patterns, changes))
     longest = frames[max(runs, key=len)]
     return np.float32(0.5) * (longest.max(axis=0) - longest.min(axis=0)).astype(np.float32)
 

@@ -56,7 +56,7 @@ def peaks(frames: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def choose_exposure(
-    highest: np.ndarray, exposures: Sequence[float], full_scale: int | None = None
+    highest: np.ndarray, exposures: Sequence[float], full_scale: int | None
 ) -> np.ndarray:
     """Return the index (h, w) uint8 into `exposures` of each pixel, from its `peaks` (k, h, w) in
     each of them."""

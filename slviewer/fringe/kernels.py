@@ -143,10 +143,8 @@ def prefetch_row(stack, frame, row):
 def combine_samples(a, b, c, d):
     """Combine the samples (p, q, r, s) of a line of `Steps`: sum, p - r - q + s, p - r + q - s, and
     the largest."""
-    ac, bd = (
-        subtract_fixed_width(to_signed(a), to_signed(c)),
-        subtract_fixed_width(to_signed(b), to_signed(d)),
-    )
+    ac = subtract_fixed_width(to_signed(a), to_signed(c))
+    bd = subtract_fixed_width(to_signed(b), to_signed(d))
     total = add_fixed_width(
         add_fixed_width(to_signed(a), to_signed(b)), add_fixed_width(to_signed(c), to_signed(d))
     )
@@ -186,12 +184,10 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
         i, j = shift.frames[k], shift.frames[k + 1]
         a, b, c, d = stack[i[0], row], stack[i[1], row], stack[i[2], row], stack[i[3], row]
         e, f, g, h = stack[j[0], row], stack[j[1], row], stack[j[2], row], stack[j[3], row]
-        cos_a, sin_a, cos_e, sin_e = (
-            shift.cosines[k],
-            shift.sines[k],
-            shift.cosines[k + 1],
-            shift.sines[k + 1],
-        )
+        cos_a = shift.cosines[k]
+        sin_a = shift.sines[k]
+        cos_e = shift.cosines[k + 1]
+        sin_e = shift.sines[k + 1]
         for q in range(4):
             prefetch_row(stack, i[q], row)
             prefetch_row(stack, j[q], row)
@@ -245,11 +241,9 @@ def shift_row(stack, shift, row, wrapped, modulation, background, peak):
     width, first = stack.shape[2], stack[shift.first, row]
     cosine, sine, total = allocate_three(width)
     sums_row(stack, shift, row, cosine, sine, total, peak)
-    per_two, per_one, counted = (
-        np.float32(2 / shift.steps),
-        np.float32(1 / shift.steps),
-        np.float32(shift.counted),
-    )
+    per_two = np.float32(2 / shift.steps)
+    per_one = np.float32(1 / shift.steps)
+    counted = np.float32(shift.counted)
     for x in range(width):
         wrapped[x] = arctan2(ZERO - sine[x], cosine[x])
         modulation[x] = np.sqrt(fma(cosine[x], cosine[x], sine[x] * sine[x])) * per_two

@@ -28,11 +28,9 @@ from slviewer.fringe.kernels import (
 from slviewer.geometry.jit import fma, kernel
 
 EDGE, FAR_EDGE = np.float32(limits.EDGE), np.float32(1 - limits.EDGE)
-WEAK, WEAKER, UNDECIDED = (
-    np.float32(limits.WEAK_BIT / 2),
-    np.float32(limits.WEAKER),
-    np.float32(limits.UNDECIDED_BIT),
-)
+WEAK = np.float32(limits.WEAK_BIT / 2)
+WEAKER = np.float32(limits.WEAKER)
+UNDECIDED = np.float32(limits.UNDECIDED_BIT)
 
 
 class CodeRules(NamedTuple):
@@ -114,10 +112,15 @@ def opposed_code_row(stack, frames, inverses, row, code, least, top, bottom, low
 
 @numba.njit(inline="always")
 def plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lower, upper):
-    """Read the binary code of one image row from bits and their threshold, see `code_row`."""
+    """Read the binary code of one image row from bits and their threshold, see `code_row`.
+
+    Above one threshold the brightest and the darkest sample decide ``top`` and ``bottom``, the
+    nearest ones on either side ``least``, and the last ones at a 1 and at a 0 the edges. So only
+    these samples are kept while the bits are read, as the frames' own numbers, of which four times
+    as many fit a register as of floats, and heights are computed from them at the end. ``bits``
+    holds the digits of up to eight bits, which are then appended to the code.
+    """
     width = stack.shape[2]
-    # Against one threshold the frames' own numbers can be compared: four times as many fit a
-    # register.
     grey = stack.dtype.type
     full = grey(65535 if stack.itemsize == 2 else 255)
     level, bits = np.empty(width, stack.dtype), np.empty(width, np.uint8)
@@ -125,13 +128,13 @@ def plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lowe
     most, fewest = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
     at_one, at_nought = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
     for x in range(width):
-        level[x] = grey(np.int32(threshold[x]))
+        level[x] = grey(np.int32(threshold[x]))  # rounded down: over it is over the threshold
         over_least[x] = fewest[x] = full
         under_most[x] = most[x] = at_one[x] = at_nought[x] = grey(0)
         bits[x] = code[x] = 0
     for start in range(0, len(frames), 8):
         last = min(start + 8, len(frames))
-        if (last - start) % 2:
+        if (last - start) % 2:  # an odd bit first
             frame = stack[frames[start], row]
             prefetch_row(stack, frames[start], row)
             for x in range(width):
@@ -169,19 +172,17 @@ def plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lowe
                 )
                 so_far = np.uint8(np.uint8(bits[x] + bits[x]) | one)
                 bits[x] = np.uint8(np.uint8(so_far + so_far) | two)
-                most[x], fewest[x] = (
-                    max(most[x], max(value, after)),
-                    min(fewest[x], min(value, after)),
-                )
+                most[x] = max(most[x], max(value, after))
+                fewest[x] = min(fewest[x], min(value, after))
+        # append the digits
         more, held = np.int32(1 << (last - start)), np.uint8((1 << (last - start)) - 1)
         for x in range(width):
             code[x] = np.int32(np.int32(code[x] * more) + np.int32(np.uint8(bits[x] & held)))
+    # the heights above the threshold of the samples that were kept
     for x in range(width):
-        level_x, nearest_over, nearest_under = (
-            threshold[x],
-            np.float32(over_least[x]),
-            np.float32(under_most[x]),
-        )
+        level_x = threshold[x]
+        nearest_over = np.float32(over_least[x])
+        nearest_under = np.float32(under_most[x])
         above = nearest_over - level_x if most[x] > level[x] else ENDLESS
         below = level_x - nearest_under if fewest[x] <= level[x] else ENDLESS
         least[x] = min(above, below)
@@ -237,10 +238,8 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
             # On a blurred edge the bit nearest the middle and the phase may disagree about the
             # side: the phase decides.
             contrast = max(top[x] * per_rest, ZERO - bottom[x] * per_mean)
-            below, above = (
-                abs(lower[x] - off_middle * contrast),
-                abs(upper[x] - off_middle * contrast),
-            )
+            below = abs(lower[x] - off_middle * contrast)
+            above = abs(upper[x] - off_middle * contrast)
             ahead = (part < EDGE) & (above < WEAK * contrast) & (above < WEAKER * below)
             behind = (part >= FAR_EDGE) & (below < WEAK * contrast) & (below < WEAKER * above)
             periods = np.float32(code[x]) - whole
@@ -255,11 +254,9 @@ def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, b
     """Decode rows from ``first`` on by a phase shift of one period with a plain or complementary
     Gray code, see `kernels.decode_rows`; the five maps contain only these rows."""
     width, steps = stack.shape[2], select_period(shifts, 0)
-    peak, code, buffers = (
-        np.empty(width, stack.dtype),
-        np.empty(width, np.int32),
-        allocate_five(width),
-    )
+    peak = np.empty(width, stack.dtype)
+    code = np.empty(width, np.int32)
+    buffers = allocate_five(width)
     for i in range(len(phase)):
         row, psi, B, A = first + i, wrapped[i], modulation[i], background[i]
         shift_row(stack, steps, row, psi, B, A, peak)

@@ -17,6 +17,7 @@ class GrayRules(NamedTuple):
     ``gray``, ``inverse``: frames of the bits, most significant first, and of their inverses, or
     none; ``white`` and ``black``: frames, or -1. Cells of ``cell`` px begin at ``origin`` px; the
     projector ends at ``high`` px. ``sigma_part``: noise of a bit over that of a grey level.
+    ``binary``: the bits are plain binary numbers.
     """
 
     gray: np.ndarray
@@ -27,6 +28,7 @@ class GrayRules(NamedTuple):
     cell: float
     high: float
     sigma_part: float
+    binary: bool
 
 
 def decode_gray(
@@ -55,10 +57,8 @@ def _decode_gray_rows(
                 B, A = (bright - dim) * HALF, (bright + dim) * HALF
             else:
                 for b in range(len(gray)):
-                    bright, dim = (
-                        np.float32(stack[gray[b], row, x]),
-                        np.float32(stack[inverse[b], row, x]),
-                    )
+                    bright = np.float32(stack[gray[b], row, x])
+                    dim = np.float32(stack[inverse[b], row, x])
                     B += abs(bright - dim)
                     A += bright + dim
                 B *= np.float32(0.5 / len(gray))
@@ -74,6 +74,8 @@ def _decode_gray_rows(
             for b in range(len(gray)):
                 bit_above = bit_height(stack, gray, inverse, b, row, x, A)
                 doubt = int(abs(bit_above) < limit)
+                if rules.binary:
+                    bit, flipped = 0, 0
                 bit ^= int(bit_above > 0)
                 flipped ^= int(bit_above > 0) ^ doubt
                 code, other = 2 * code + bit, 2 * other + flipped
@@ -82,10 +84,8 @@ def _decode_gray_rows(
             modulation[row, x], background[row, x], wrapped[row, x] = B, A, NAN
             dark = (doubts >= limits.DARK_BITS) | is_dark(B, A, scale)
             reason[row, x] = select_reason(dark, False, unclear)
-            start, end = (
-                rules.origin + rules.cell * min(code, other),
-                rules.origin + rules.cell * (max(code, other) + 1),
-            )
+            start = rules.origin + rules.cell * min(code, other)
+            end = rules.origin + rules.cell * (max(code, other) + 1)
             first, last = max(start, -0.5), min(end, rules.high)
             centre = 0.5 * (first + last if first < last else start + end)
             phase[row, x] = NAN if dark | unclear else np.float32(per_px * centre)

@@ -191,11 +191,9 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
         steps = select_period(shifts, i)
         sums_row(stack, steps, row, cosine, sine, total, peak)
         first, wrapped = stack[steps.first, row], psi[i]
-        per_two, per_one, counted = (
-            np.float32(2 / steps.steps),
-            np.float32(1 / steps.steps),
-            np.float32(steps.counted),
-        )
+        per_two = np.float32(2 / steps.steps)
+        per_one = np.float32(1 / steps.steps)
+        counted = np.float32(steps.counted)
         for x in range(width):
             wrapped[x] = arctan2(ZERO - sine[x], cosine[x])
             level = np.float32(first[x])
@@ -230,11 +228,9 @@ def levels_rows(
     cells, if any; see `kernels.decode_rows`. The five maps, of the finest period, contain only
     these rows."""
     count, width, bits = len(shifts.steps), stack.shape[2], len(ladder.bits)
-    psi, peak, buffers = (
-        np.empty((count, width), np.float32),
-        np.empty(width, stack.dtype),
-        allocate_levels(width),
-    )
+    psi = np.empty((count, width), np.float32)
+    peak = np.empty(width, stack.dtype)
+    buffers = allocate_levels(width)
     clipped, weakest, coordinate, order, own, worst, _, _, _ = buffers
     heights, cell = np.empty(bits, np.float32), np.empty(width if bits else 0, np.float32)
     for i in range(len(phase)):

@@ -19,19 +19,15 @@ from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.phase import Reason
 from slviewer.geometry.jit import kernel, run_rows
 
-INCONSISTENT, OUTSIDE, UNCHANGED = (
-    np.uint8(Reason.INCONSISTENT),
-    np.uint8(Reason.OUTSIDE),
-    np.uint8(0),
-)
+INCONSISTENT = np.uint8(Reason.INCONSISTENT)
+OUTSIDE = np.uint8(Reason.OUTSIDE)
+UNCHANGED = np.uint8(0)
 UP, DOWN = np.uint8(1), np.uint8(2)
 TURN, PER_TURN = np.float32(2 * math.pi), np.float32(0.5 / math.pi)
 HALF, ONE, INVALID = np.float32(0.5), np.float32(1), np.float32(math.nan)
-EDGE, FAR_EDGE, WHOLE = (
-    np.float32(limits.EDGE),
-    np.float32(1 - limits.EDGE),
-    np.float32(limits.WHOLE_PERIOD),
-)
+EDGE = np.float32(limits.EDGE)
+FAR_EDGE = np.float32(1 - limits.EDGE)
+WHOLE = np.float32(limits.WHOLE_PERIOD)
 WINDOW, MAJORITY, NEIGHBOURS = limits.WINDOW, limits.SPIKE_MAJORITY, limits.SPIKE_NEIGHBOURS
 LONELY, LONELY_NEIGHBOURS = limits.LONELY, limits.LONELY_NEIGHBOURS
 ENOUGH = math.ceil(LONELY * ((2 * WINDOW + 1) ** 2 - 1))

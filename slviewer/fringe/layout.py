@@ -38,7 +38,8 @@ class Layout:
 
     ``extent`` is that of the projector in px, infinite where its size is not known. ``shifts``
     longest period first; ``gray`` most significant bit first; ``inverse`` like ``gray``, or empty.
-    ``relative``: whether a phase that is not absolute is acceptable.
+    ``relative``: whether a phase that is not absolute is acceptable. ``binary``: as in the
+    sequence.
     """
 
     axis: Axis
@@ -54,6 +55,7 @@ class Layout:
     offset_rad: float = 0.0
     gray_cell_px: float = 1.0
     relative: bool = False
+    binary: bool = False
 
     @property
     def period_px(self) -> float:
@@ -118,7 +120,15 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
         sequence.offset_rad(axis),
         sequence.gray_cell(axis),
         sequence.relative or sequence.projector_size is None,
+        sequence.binary,
     )
+    if sequence.binary and shifts:
+        raise InputError(
+            "plain binary numbers beside phase steps are not decoded: several of their bits change"
+            " at the same place",
+            "project Gray code",
+            f"axis {axis}",
+        )
     if not (shifts or layout.inverse or None not in (white, black)):
         raise InputError(
             "Gray code alone needs its inverses, or a white and a black frame",

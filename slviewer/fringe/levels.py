@@ -132,7 +132,7 @@ def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ..
 
 
 def unwrap_levels(
-    levels: tuple[Level, ...], wrapped: list[np.ndarray], low: float, near: np.ndarray | None = None
+    levels: tuple[Level, ...], wrapped: list[np.ndarray], low: float, near: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Unwrap level by level: coordinate px and order of the finest period, float64 of the shape of
     its phase.

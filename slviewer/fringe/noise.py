@@ -1,6 +1,7 @@
 """Measurement of the camera's noise from the frames of one capture."""
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,11 +14,22 @@ BLOCK = 8
 """Neighbouring pixels whose variances are averaged before the median: single variances are too
 skewed."""
 BINS = 16
+DARKEST = 0.05
+"""Of white: darker blocks that never change may be image without noise."""
 QUANTISATION = 1 / 12
 """Variance of rounding to whole grey levels, in squared grey levels: no frame has less noise."""
 OWN_HARMONICS = 4
 """Highest harmonic that is fitted pixel by pixel; those that gamma adds beyond it are below the
 noise."""
+
+
+class Blocks(NamedTuple):
+    """Noise of blocks of pixels: their mean ``levels`` (b,), and ``variances`` (b,) of one frame's
+    grey level, each with so many degrees of ``freedom``."""
+
+    levels: np.ndarray
+    variances: np.ndarray
+    freedom: float
 
 
 def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[float, float]:
@@ -34,21 +46,21 @@ def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[floa
     image rows or columns, whichever are smaller: those along the stripes. Sampled from a few rows,
     or columns, of the image.
     """
-    bins = []
+    bins = list[Blocks]()
     if layout.steps >= 4:
         bins.append(_measure_phase_step_noise(sample(stack, layout.shifts[-1].indices), white))
     elif len(layout.inverse) >= 2:
         bins.append(
             _measure_inverse_noise(sample(stack, layout.gray), sample(stack, layout.inverse), white)
         )
-    if not any(len(levels) for levels, *_ in bins):
+    if not any(len(each.levels) for each in bins):
         frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
         indices = tuple(i for i in frames if i is not None)
         bins = [
             _measure_difference_noise(sample(s, indices), white)
             for s in (stack, stack.transpose(0, 2, 1))
         ]
-    fits = [_bin_variances(*measured) for measured in bins if len(measured[0])]
+    fits = [_bin_variances(*measured) for measured in bins if len(measured.levels)]
     # Fringes and texture only ever add to the differences.
     a, b = _fit_line(*min(fits, key=_compute_mean_variance)) if fits else (0.0, 0.0)
     return (a, b) if a + b * white / 2 > QUANTISATION else (QUANTISATION, 0.0)
@@ -75,11 +87,8 @@ def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
     return out
 
 
-def _measure_phase_step_noise(
-    samples: np.ndarray, white: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return levels, variances and degrees of freedom of blocks, from the residual of cosines in
-    the phase steps."""
+def _measure_phase_step_noise(samples: np.ndarray, white: float) -> Blocks:
+    """Measure the noise of blocks from the residual of cosines in the phase steps."""
     n = len(samples)
     samples = _select_unclipped(samples, white)  # (n, blocks, BLOCK)
     own = max(1, min(OWN_HARMONICS, (n - 1) // 2 - 2))
@@ -95,7 +104,7 @@ def _measure_phase_step_noise(
     variance = (
         np.einsum("wp,wp->p", residue, residue).reshape(samples.shape[1:]).mean(axis=-1) / freedom
     )
-    return samples.mean(axis=(0, 2)), variance, freedom * samples.shape[-1]
+    return Blocks(samples.mean(axis=(0, 2)), variance, freedom * samples.shape[-1])
 
 
 @cache
@@ -106,50 +115,46 @@ def _list_residual_directions(n: int, own: int) -> np.ndarray:
     return np.ascontiguousarray(basis[:, 1 + 2 * own :].T.astype(np.float32))
 
 
-def _measure_inverse_noise(
-    gray: np.ndarray, inverse: np.ndarray, white: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return levels, variances and degrees of freedom of blocks, from sums of bits and their
-    inverses."""
+def _measure_inverse_noise(gray: np.ndarray, inverse: np.ndarray, white: float) -> Blocks:
+    """Measure the noise of blocks from sums of bits and their inverses."""
     both = _select_unclipped(np.concatenate([gray, inverse]), white)
     total = both[: len(gray)] + both[len(gray) :]
     # Interreflected light and room light hardly differ between neighbours.
     rest = total - total.mean(axis=0)
     rest -= rest.mean(axis=-1, keepdims=True)
     freedom = (len(total) - 1) * max(total.shape[-1] - 1, 1)
-    return total.mean(axis=(0, -1)) / 2, (rest**2).sum(axis=(0, -1)) / (2 * freedom), freedom
+    variances = (rest**2).sum(axis=(0, -1)) / (2 * freedom)
+    return Blocks(total.mean(axis=(0, -1)) / 2, variances, freedom)
 
 
-def _measure_difference_noise(
-    samples: np.ndarray, white: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return levels, variances and degrees of freedom of blocks, from third differences along a
-    line.
+def _measure_difference_noise(samples: np.ndarray, white: float) -> Blocks:
+    """Measure the noise of blocks from third differences along a line.
 
     Fringes and shading are nearly quadratic over four pixels.
     """
     if samples.shape[-1] < BLOCK:
-        return np.zeros(0), np.zeros(0), 1.0
+        return Blocks(np.zeros(0), np.zeros(0), 1.0)
     usable = _select_unclipped(samples, white)
     if usable.size:
         samples = usable.reshape(-1, samples.shape[-1])  # each frame has its own level
     else:
         is_unclipped = (samples.max(axis=-1) < white) & (samples.min(axis=-1) > 0)
         samples = samples[is_unclipped].astype(np.float32)
-    third = np.diff(samples, n=3, axis=-1)
-    # 1 + 9 + 9 + 1; five that overlap
-    return (
-        samples.mean(axis=-1),
-        (third**2).mean(axis=-1) / 20,
-        2.5,
-    )
+    # Independent noise of variance 1 gives third differences with coefficients 1, 3, 3, 1 the
+    # covariances c = 20, -15, 6, -1 at distances d = 0 ... 3. The mean square of the five in a
+    # block has the relative variance 2 / f of a chi squared with f degrees of freedom, where
+    # f = (5 c_0)^2 / (5 c_0^2 + 2 sum_d (5 - d) c_d^2) = 2.5.
+    squares = np.diff(samples, n=3, axis=-1) ** 2
+    return Blocks(samples.mean(axis=-1), squares.mean(axis=-1) / 20, 2.5)
 
 
 def _select_unclipped(samples: np.ndarray, white: float) -> np.ndarray:
     """Return the sampled blocks (n, blocks, BLOCK) float32 that are clipped neither at white nor at
-    black in any of the n frames, which would hide noise."""
+    black in any of the n frames, which would hide noise, nor have one level throughout, as bars
+    and masks do, which are not image; in the `DARKEST`, compression may have removed the noise."""
     highest, lowest = samples.max(axis=0).max(axis=-1), samples.min(axis=0).min(axis=-1)
-    usable = ((highest < white) & (lowest > 0)).ravel()
+    is_image = (highest > lowest) | (highest < DARKEST * white)
+    usable = ((highest < white) & (lowest > 0) & is_image).ravel()
     blocks = samples.reshape(len(samples), usable.size, samples.shape[-1])
     return np.compress(usable, blocks, axis=1).astype(np.float32)
 

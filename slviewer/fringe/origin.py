@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from slviewer.errors import InputError
@@ -96,8 +97,33 @@ def measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> Code
     ``white``.
 
     An edge is at a phase between those of two neighbouring pixels. The result is the phase inside
-    the largest number of these intervals, which is more precise than any one of them.
+    the largest number of these intervals, which is more precise than any one of them. Of blurred
+    edges, which lie beside their pixels, it is the mean of the intervals' middles.
     """
+    start, length = _list_edges(layout, stack, white)
+    rises = length > 0
+    rising = float(rises.mean()) if len(rises) else 0.0
+    none = CodeOrigin(np.nan, len(rises), rising)
+    if len(rises) < MIN_EDGES or rising < MIN_RISING:
+        return none
+    start, length = start[rises], length[rises]
+    places = np.linspace(-np.pi, np.pi, _CANDIDATES, endpoint=False)
+    inside = _count_intervals(start, length)
+    is_exact = inside.max() >= MIN_CONCENTRATION * len(start)
+    chosen = np.exp(1j * places)[inside > _BEST_SHARE * inside.max()]
+    if not is_exact:
+        middle = np.exp(1j * (start + length / 2))
+        common = complex(middle.mean())
+        if abs(common) < MIN_CONCENTRATION:
+            return none
+        chosen = middle[np.abs(np.angle(middle / common)) < np.pi / 4]
+    return CodeOrigin(float(np.angle(chosen.mean()) / (2 * np.pi)), len(start), rising, is_exact)
+
+
+def _list_edges(layout: Layout, stack: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the phase (k,) rad of the pixel before each code edge, less half a period where the
+    cell that begins there is the second half of one, and the change (k,) of the phase to the pixel
+    behind it."""
     along_x = layout.axis == "x"
     step = max(1, stack.shape[1 if along_x else 2] // LINES)
     stack = np.ascontiguousarray(stack[:, ::step] if along_x else stack[:, :, ::step])
@@ -110,36 +136,41 @@ def measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> Code
     for i in [*layout.gray] + ([] if layout.complementary is None else [layout.complementary]):
         digit ^= bit_heights(layout, stack, i, background) > 0
         code = 2 * code + digit
-    first, second = (np.s_[:, :-1], np.s_[:, 1:]) if along_x else (np.s_[:-1], np.s_[1:])
-    origins, lengths = [], []
+    if not along_x:
+        wrapped, illuminated, code = wrapped.T, illuminated.T, code.T
+    wrapped = _average_noisy(np.exp(1j * wrapped) * illuminated)
+    first, second = np.s_[:, :-1], np.s_[:, 1:]
+    starts, lengths = [], []
     for here, there in ((first, second), (second, first)):
         edge = illuminated[here] & illuminated[there] & (code[there] == code[here] + 1)
         below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
-        # the cell that starts here is the second half of a period if odd
+        lengths.append(np.angle(np.exp(1j * (above - below))))
         if layout.complementary is not None:
             below = below - (code[there][edge] & 1) * np.pi
-            above = above - (code[there][edge] & 1) * np.pi
-        origins.append(below)
-        lengths.append(np.angle(np.exp(1j * (above - below))))
-    origin, length = np.concatenate(origins), np.concatenate(lengths)
-    rising = float(np.mean(length > 0)) if len(length) else 0.0
-    none = CodeOrigin(np.nan, len(origin), rising)
-    if len(origin) < MIN_EDGES or rising < MIN_RISING:
-        return none
-    origin, length = origin[length > 0], length[length > 0]
-    places = np.linspace(-np.pi, np.pi, _CANDIDATES, endpoint=False)
-    start = np.mod((origin + np.pi) / (2 * np.pi), 1.0) * _CANDIDATES
+        starts.append(below)
+    return np.concatenate(starts), np.concatenate(lengths)
+
+
+def _average_noisy(phasors: np.ndarray) -> np.ndarray:
+    """Return the phases (h, w) rad of unit phasors (h, w), 0 where dark, averaged along the rows
+    over so many pixels that the noise of neighbours stays below half of their difference."""
+    products = phasors[:, 1:] * phasors[:, :-1].conj()
+    products = products[products != 0]
+    mean = complex(products.mean()) if len(products) else 1.0
+    change = max(abs(np.angle(mean)), 1e-6)
+    noise = np.sqrt(max(-2 * np.log(max(abs(mean), 1e-6)), 0.0))
+    count = int(min(np.ceil(2 * noise / change), np.pi / 2 / change))
+    if count > 1:
+        kernel = count | 1, 1
+        phasors = cv2.blur(phasors.real, kernel) + 1j * cv2.blur(phasors.imag, kernel)
+    return np.angle(phasors)
+
+
+def _count_intervals(start: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Return how many of the intervals of phase (k,) rad hold each of the candidates from -pi on;
+    those that pass pi continue at -pi."""
+    first = np.mod((start + np.pi) / (2 * np.pi), 1.0) * _CANDIDATES
     change = np.zeros(3 * _CANDIDATES)
-    np.add.at(change, np.ceil(start).astype(int), 1.0)
-    np.add.at(change, np.floor(start + length / (2 * np.pi) * _CANDIDATES).astype(int) + 1, -1.0)
-    count = np.cumsum(change).reshape(3, _CANDIDATES).sum(0)
-    if count.max() < MIN_CONCENTRATION * len(origin):  # blurred edges lie beside their pixels
-        middle = np.exp(1j * (origin + length / 2))
-        common = complex(middle.mean())
-        if abs(common) < MIN_CONCENTRATION:
-            return none
-        near = np.abs(np.angle(middle / common)) < np.pi / 4
-        turns = float(np.angle(middle[near].mean()) / (2 * np.pi))
-        return CodeOrigin(turns, len(origin), rising, is_exact=False)
-    best = np.exp(1j * places)[count > _BEST_SHARE * count.max()]
-    return CodeOrigin(float(np.angle(best.mean()) / (2 * np.pi)), len(origin), rising)
+    np.add.at(change, np.ceil(first).astype(int), 1.0)
+    np.add.at(change, np.floor(first + length / (2 * np.pi) * _CANDIDATES).astype(int) + 1, -1.0)
+    return np.asarray(np.cumsum(change).reshape(3, _CANDIDATES).sum(0))

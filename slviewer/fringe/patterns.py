@@ -54,6 +54,14 @@ def _compute_gray_bit(sequence: PatternSequence, axis: Axis, frame: Frame) -> np
             f" cells of {cell:g} px",
             "use more bits, or the origin -0.5",
         )
-    gray = code ^ (code >> 1)
-    bit = (gray >> (0 if half else bits - 1 - frame.bit)) & 1
-    return bit == (0 if frame.kind == "inverse" else 1)
+    return evaluate_bit(sequence, frame, code)
+
+
+def evaluate_bit(sequence: PatternSequence, frame: Frame, code: np.ndarray) -> np.ndarray:
+    """Return whether a frame of a code is bright, bool, in the cells of these numbers, int; of a
+    complementary one the cells are half as wide."""
+    assert frame.axis is not None
+    is_half = frame.kind == "complementary"
+    place = 0 if is_half else len(sequence.find("gray", frame.axis)) - 1 - frame.bit
+    shown = code if sequence.binary else code ^ (code >> 1)
+    return np.asarray((shown >> place) & 1 == (frame.kind != "inverse"))

@@ -109,9 +109,14 @@ class PhaseMap:
         return bool(np.isfinite(self.unambiguous_px))
 
     @property
+    def px_per_rad(self) -> float:
+        """Projector px over which the finest phase grows by 1 rad."""
+        return self.period_px / (2 * np.pi)
+
+    @property
     def coordinate(self) -> np.ndarray:
         """(h, w) float32 px: the projector column (axis x) or row (axis y), NaN where invalid."""
-        return self.phase * np.float32(self.period_px / (2 * np.pi))
+        return self.phase * np.float32(self.px_per_rad)
 
     @property
     def sigma_phase(self) -> np.ndarray:
@@ -139,7 +144,7 @@ class PhaseMap:
     @property
     def sigma_px(self) -> np.ndarray:
         """(h, w) float32 px: `sigma_phase` as standard deviation of the coordinate."""
-        return self.sigma_phase * np.float32(self.period_px / (2 * np.pi))
+        return self.sigma_phase * np.float32(self.px_per_rad)
 
     @cached_property
     def edge_displacement(self) -> EdgeDisplacement:
@@ -167,7 +172,7 @@ class PhaseMap:
     def edge_error_px(self) -> np.ndarray:
         """(h, w) float32 px: error of the coordinate due to the camera's blur, NaN where the phase
         is."""
-        return np.abs(self.edge_displacement.shift) * np.float32(self.period_px / (2 * np.pi))
+        return np.abs(self.edge_displacement.shift) * np.float32(self.px_per_rad)
 
     def correct_edges(self) -> tuple[PhaseMap, np.ndarray]:
         """Return the phase map without the displacement by the camera's blur where the surface
@@ -176,9 +181,7 @@ class PhaseMap:
         """
         moved = self.edge_displacement
         corrected = np.where(moved.is_continuous, self.phase - moved.shift, self.phase)
-        return replace(self, phase=corrected), moved.remaining * np.float32(
-            self.period_px / (2 * np.pi)
-        )
+        return replace(self, phase=corrected), moved.remaining * np.float32(self.px_per_rad)
 
 
 PhaseMaps = Mapping[Axis, PhaseMap]

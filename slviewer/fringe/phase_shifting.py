@@ -151,10 +151,8 @@ def detect_border_pixels(
     Third, the least height (h, w) of the bits that change at neither border. The bit that is near
     the middle of black and white determines the border.
     """
-    top, bottom = (
-        np.maximum(heights.max(axis=0), np.float32(0)),
-        np.minimum(heights.min(axis=0), np.float32(0)),
-    )
+    top = np.maximum(heights.max(axis=0), np.float32(0))
+    bottom = np.minimum(heights.min(axis=0), np.float32(0))
     mean = np.float32(fringe_mean(layout, stack))
     contrast = np.maximum(top / (1 - mean), -bottom / mean)
     middle = (np.float32(0.5) - mean) * contrast

@@ -28,14 +28,17 @@ def p18(projector: Size, steps: int = 18) -> PatternSequence:
     return PatternSequence(projector, tuple(frames))
 
 
-def gray(projector: Size) -> PatternSequence:
+def gray(projector: Size, cell_px: int = 1) -> PatternSequence:
     """Return Gray code alone, each bit followed by its inverse; x, then y, white, black
-    (procam-calibration layout)."""
+    (procam-calibration layout). Its cells are ``cell_px`` wide."""
+    if not 1 <= cell_px <= min(projector):
+        raise InputError(f"Gray code in cells of {cell_px} px is not possible", "give 1 px or more")
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
-        for bit in gray_bits(axis, bits_for(extent)):
+        for bit in gray_bits(axis, bits_for(extent / cell_px)):
             frames += [bit, replace(bit, kind="inverse")]
-    return PatternSequence(projector, (*frames, Frame("white"), Frame("black")))
+    cell = None if cell_px == 1 else float(cell_px)
+    return PatternSequence(projector, (*frames, Frame("white"), Frame("black")), gray_cell_px=cell)
 
 
 def complementary(projector: Size, steps: int = 8, period_px: float = 16.0) -> PatternSequence:

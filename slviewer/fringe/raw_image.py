@@ -14,6 +14,12 @@ RAW_SUFFIXES = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2"}
 )
 
+MOSAIC_TILES = 8
+"""Parts along each side of an image in which an alternation is measured."""
+LEAST_MOSAIC, SAME_SIGN = 0.02, 0.9
+"""Alternation over the brightness from which on pixels are a mosaic: rows and columns of one sensor
+differ by less than 1 %; share of the tiles in which it has one sign."""
+
 
 @dataclass(frozen=True, eq=False)
 class RawImage:
@@ -69,3 +75,48 @@ def develop(data: bytes, name: str, most_pixels: int = 2**28) -> RawImage:
     if rgb.ndim == 2 or rgb.shape[2] == 1:
         rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)
     return RawImage(rgb, int(full_scale), float(focal_mm))
+
+
+def describe_mosaic(name: str, frames: np.ndarray) -> str:
+    """Return a warning where frames (n, h, w) of a capture are raw mosaics; empty where not."""
+    share = measure_mosaic(frames)
+    if not share:
+        return ""
+    return (
+        f"{name}: its images alternate from pixel to pixel by {200 * share:.0f} %, as the raw"
+        " mosaic (Bayer pattern) of a colour camera does that is saved as grey, which displaces"
+        " edges and fringes: let the camera save colour or monochrome images, or interpolate the"
+        " mosaic to colour images, of which one channel is read"
+    )
+
+
+def measure_mosaic(frames: np.ndarray) -> float:
+    """Return by which share of the brightness the 2x2 neighbours of frames (n, h, w) differ in all
+    of the image, as those of a colour camera's raw mosaic do; 0 where they do not.
+
+    Two of its pixels, diagonal neighbours, see green: the diagonals differ, or, where red and blue
+    together are as bright, columns and rows alike. Stripes make only columns or only rows differ.
+    """
+    height, width = (side // 2 * 2 for side in frames.shape[1:])
+    # stripes and their inverses, or all steps of a period, add up to even light
+    mean = np.asarray(frames[:, :height, :width].mean(axis=0, dtype=np.float32))
+    a, b, c, d = mean[::2, ::2], mean[::2, 1::2], mean[1::2, ::2], mean[1::2, 1::2]
+    total = a + b + c + d
+    is_lit = total > np.quantile(total, 0.5) / 2
+    if not is_lit.any():
+        return 0.0
+    alternations = []
+    for difference in (a + d - b - c, a + c - b - d, a + b - c - d):
+        share = np.where(is_lit, difference / np.maximum(total, 1e-6), np.nan)
+        tiles = [
+            float(np.nanmedian(tile))
+            for rows in np.array_split(share, MOSAIC_TILES)
+            for tile in np.array_split(rows, MOSAIC_TILES, axis=1)
+            if np.isfinite(tile).sum() > tile.size / 2
+        ]
+        middle = float(np.median(tiles)) if tiles else 0.0
+        same = np.mean(np.sign(tiles) == np.sign(middle)) if tiles else 0.0
+        alternations.append(abs(middle) if same >= SAME_SIGN else 0.0)
+    diagonals, columns, rows = alternations
+    largest = max(diagonals, min(columns, rows))
+    return largest if largest >= LEAST_MOSAIC else 0.0

@@ -13,6 +13,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.cosines import FEWEST, select_rows
 from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.vectors import rms
 
 _FINE = 16  # places per grey level at which a response is tabulated before it is inverted
 
@@ -40,7 +41,7 @@ def predict_phase_error(shown: np.ndarray, seen: np.ndarray, steps: int) -> floa
     k = 2 * np.pi * np.arange(steps)[:, None] / steps
     light = curve(0.5 + 0.5 * np.cos(phase + k))
     error = np.angle((light * np.exp(-1j * k)).sum(0) * np.exp(-1j * phase))
-    return float(np.sqrt(np.mean(error**2)))
+    return rms(error)
 
 
 def linearise_levels(shown: np.ndarray, seen: np.ndarray) -> tuple[int, ...]:

@@ -18,6 +18,8 @@ Size = tuple[int, int]
 T = TypeVar("T")
 Kind = Literal["phase", "gray", "inverse", "complementary", "white", "black", "texture"]
 
+KINDS = ", ".join(get_args(Kind)) + ", or in a TOML binary"
+"""In words."""
 _FIELDS = {
     "phase": ("axis", "step", "steps", "period_px"),
     "gray": ("axis", "bit", "bits"),
@@ -34,8 +36,7 @@ MAX_EXTENT = 1 << 16
 """Columns and rows of a projector, px."""
 SEQUENCE_KEYS = (
     "projector", "phase_sign", "phase_offset", "gray_origin", "gray_cell_px", "relative", "levels",
-    "full_scale",
-    "frame",
+    "full_scale", "code", "frame",
 )  # fmt: skip
 """The entries of `PatternSequence.to_dict`, and of a `frames` TOML."""
 
@@ -69,9 +70,7 @@ class Frame:
     def __post_init__(self) -> None:
         """Raise InputError where the fields of the frame are missing or out of range."""
         if self.kind not in get_args(Kind):
-            raise InputError(
-                f"frame kind '{self.kind}' is unknown", f"use one of {', '.join(get_args(Kind))}"
-            )
+            raise InputError(f"frame kind '{self.kind}' is unknown", f"use one of {KINDS}")
         if self.axis not in (None, "x", "y"):
             raise InputError(
                 f"frame axis '{self.axis}' is unknown",
@@ -153,9 +152,10 @@ class PatternSequence:
     axis is always relative. ``levels``: for each grey level 0 ... 255 of a cosine the one that is
     shown in its place, so that a projector whose light is not proportional to it shows cosines;
     None where they are the same. It records what was shown; decoding does not use it.
-    ``full_scale``: grey level at which the camera clips, as the camera, the format or the operator
-    states it, 4095 for the 12 bits in a uint16; None: derived from the brightest pixel, see
-    `layout.clip_level`.
+    ``binary``: the Gray bits and their inverses show plain binary numbers instead, which is decoded
+    without phase steps only. ``full_scale``: grey level at which the camera clips, as the camera,
+    the format or the operator states it, 4095 for the 12 bits in a uint16; None: derived from the
+    brightest pixel, see `layout.clip_level`.
 
     Raises InputError when steps or bits are missing, repeated, or contradict each other, or a value
     is out of range.
@@ -170,6 +170,7 @@ class PatternSequence:
     gray_cell_px: float | PerAxis[float | None] | None = None
     relative: bool = False
     full_scale: int | None = None
+    binary: bool = False
 
     def __post_init__(self) -> None:
         """Check the frames and conventions, and replace pairs of equal values by one value. Raises
@@ -267,6 +268,11 @@ class PatternSequence:
             if (f.axis == axis and "axis" in _FIELDS[f.kind])
             or (f.kind in ("white", "black") and f.axis in (None, axis))
         ]
+
+    @property
+    def patterns(self) -> list[int]:
+        """The indices of the frames that are not the texture."""
+        return [i for i, frame in enumerate(self.frames) if frame.kind != "texture"]
 
     def find(self, kind: Kind, axis: Axis) -> list[int]:
         """Return the indices of the axis' frames of one kind, in order."""
@@ -373,6 +379,8 @@ class PatternSequence:
             values["relative"] = True
         if self.full_scale is not None:
             values["full_scale"] = self.full_scale
+        if self.binary:
+            values["code"] = "binary"
         return values
 
     @classmethod
@@ -388,6 +396,8 @@ class PatternSequence:
             )
         if not isinstance(relative, bool):
             raise InputError(f"relative is {relative!r}", "use true or false")
+        if (code := data.get("code", "gray")) not in ("gray", "binary"):
+            raise InputError(f"code is {code!r}", 'use "gray" or "binary"')
         try:
             full_scale = convert(data.get("full_scale"), int | None)
         except ValidationError as error:
@@ -404,6 +414,7 @@ class PatternSequence:
             _read_values(data, "gray_cell_px", None, float),
             relative,
             full_scale,
+            code == "binary",
         )
 
 

@@ -49,6 +49,11 @@ class StereoRig:
             )
         vars(self).update(R=read_only(R), t=read_only(t))
 
+    @property
+    def baseline_mm(self) -> float:
+        """Distance of the projector from the camera."""
+        return float(np.linalg.norm(self.t))
+
     def to_projector(self, points: np.ndarray) -> np.ndarray:
         """Camera-frame points (..., 3) mm in the projector's frame, (..., 3) mm."""
         return np.asarray(points, dtype=np.float64) @ self.R.T + self.t

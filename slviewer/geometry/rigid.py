@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+_K2 = 0.9545
+"""Share of all errors within twice the standard deviation of a single number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,11 +19,13 @@ class Uncertainty:
     """Uncertainty of a registered pose (1 sigma).
 
     ``covariance`` (6, 6): of a small rotation vector (rad) about ``centre`` (3,) mm, the middle of
-    the overlap in the reference's frame, and of the translation (mm) there.
+    the overlap in the reference's frame, and of the translation (mm) there. ``noise`` (6, 6): the
+    part of it that is drawn anew with each measurement; None where all of it is.
     """
 
     covariance: np.ndarray
     centre: np.ndarray
+    noise: np.ndarray | None = None
 
     @property
     def shift_mm(self) -> float:
@@ -40,6 +44,12 @@ def rigid_transform(R: Floats, t: Floats) -> Floats:
     T = np.zeros((*np.shape(R)[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
     return T
+
+
+def invert(T: Floats) -> Floats:
+    """(..., 4, 4): the inverse of motions."""
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    return rigid_transform(R, -(R @ T[..., :3, 3:])[..., 0])
 
 
 def transform_from_rvec(rvec: ArrayLike, tvec: ArrayLike) -> Floats:
@@ -120,3 +130,31 @@ def fit_rigid(points: Floats, targets: Floats, weights: Floats | None = None) ->
     Vt[..., 2, :] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[..., None]
     R = np.swapaxes(U @ Vt, -1, -2)
     return rigid_transform(R, q0 - (R @ p0[..., None])[..., 0])
+
+
+def move_by(T: Floats, step: Floats) -> Floats:
+    """Return a transform (4, 4) turned about its origin and shifted, in the frame it maps to."""
+    R = _rotation_matrix(step[:3])
+    return rigid_transform(R @ T[:3, :3], T[:3, 3] + step[3:])
+
+
+def adjoint(T: Floats) -> Floats:
+    """Return (..., 6, 6): maps small motions from the frame that ``T`` (..., 4, 4) maps from to the
+    one that it maps to."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    J = np.zeros((*T.shape[:-2], 6, 6))
+    J[..., :3, :3] = J[..., 3:, 3:] = R
+    cross = np.zeros_like(R)
+    for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
+        cross[..., a, b], cross[..., b, a] = -t[..., k], t[..., k]
+    J[..., 3:, :3] = cross @ R
+    return J
+
+
+def coverage_radius(covariance: Floats) -> float:
+    """Return the length that the error of a vector exceeds in 4.55 % of all cases, as k = 2 is of a
+    single number; ``covariance`` (3, 3). By Satterthwaite's approximation of a sum of squares."""
+    from scipy.special import gammaincinv
+
+    total, squares = np.trace(covariance), np.trace(covariance @ covariance)
+    return float(np.sqrt(squares / total * 2 * gammaincinv(total**2 / squares / 2, _K2)))

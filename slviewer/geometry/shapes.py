@@ -175,12 +175,35 @@ def ransac_sphere(
     (n,) bool.
 
     With ``radius`` (mm), only spheres of about that size are considered and the result has exactly
-    that radius; without, spheres larger than the cloud are excluded, because any flat patch would
-    fit one.
+    that radius. Otherwise a sphere larger than the cloud is accepted only if no smaller one is
+    detected and its cap rises far more than the tolerance: any flat patch would fit one.
     """
     finite = np.asarray(points, dtype=np.float64)[finite_rows(points)]
     extent = diagonal(finite) if len(finite) else 0.0
-    low, high = (10.0 * tolerance, 0.5 * extent) if radius is None else (0.7 * radius, 1.4 * radius)
+    least, half = 10.0 * tolerance, 0.5 * extent
+    if radius is not None:
+        return _search_sphere(points, tolerance, (0.7 * radius, 1.4 * radius), radius)
+    try:
+        return _search_sphere(points, tolerance, (least, half))
+    except InputError as error:
+        try:
+            return _search_sphere(
+                points, tolerance, (half, half * extent / (4 * least)), None, least
+            )
+        except InputError:
+            raise error from None
+
+
+def _search_sphere(
+    points: np.ndarray,
+    tolerance: float,
+    radii: tuple[float, float],
+    radius: float | None = None,
+    least_rise: float = 0.0,
+) -> tuple[Sphere, np.ndarray]:
+    """As ``ransac_sphere``, among spheres of these ``radii``, of which the inliers show a cap of
+    ``least_rise`` mm at least."""
+    low, high = radii
 
     def hypotheses(quads: Floats) -> Iterable[Sphere]:
         """Return the spheres through four points each (k, 4, 3)."""
@@ -195,9 +218,11 @@ def ransac_sphere(
 
     def fit(chosen: Mask) -> Sphere:
         """Fit a sphere to the inliers (n, 3); InputError where its radius is outside the allowed
-        range."""
+        range, or its cap is too flat."""
         sphere = fit_sphere(chosen, radius)
-        if not low <= sphere.radius <= high:
+        # of a disc the diameter is four standard deviations, and a cap rises by its square / 8 R
+        rise = 2.0 * np.linalg.eigvalsh(np.cov(chosen.T))[1] / sphere.radius
+        if not low <= sphere.radius <= high or rise < least_rise:
             raise InputError(
                 f"The detected sphere has a radius of {sphere.radius:.1f} mm, too large for its"
                 " cloud."

@@ -112,3 +112,10 @@ def patch_means(
     count, means = sums[:, 0], sums[:, 1:] / sums[:, :1]
     variance = np.maximum(means[:, 4] - means[:, 3] ** 2, 0.0)
     return means[:, :3], means[:, 3], np.sqrt(variance / (count - 1))
+
+
+def list_runs(numbers: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and the last of each run of consecutive ``numbers`` (n,) int, which are
+    sorted."""
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    return [(int(run[0]), int(run[-1])) for run in runs if len(run)]

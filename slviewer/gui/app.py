@@ -19,7 +19,6 @@ from slviewer.devices.page_channel import PageState
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.geometry.jit_prepare import Preparation
 from slviewer.gui.panel import PanelContext
-from slviewer.gui.scene import FIELD_OF_VIEW, OVERVIEW
 from slviewer.gui.shell import Shell
 from slviewer.gui.widgets import alert
 from slviewer.pipeline.rig_choice import load_rig, set_up
@@ -65,14 +64,11 @@ class App:
             )
             page = self.server.viser
             page.gui.configure_theme(brand_color=_BRAND, control_width="large")
-            page.initial_camera.position, page.initial_camera.look_at = OVERVIEW
-            page.initial_camera.fov = FIELD_OF_VIEW
-            page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
             self._closing = False
             self._changed = threading.Event()
             self._folder: Path | None = None
             self._failure = ""
-            self._version = self._number = -1
+            self._version, self._number = -1, (-1, "")
             snapshot = operator.snapshot()
             self._notified = snapshot.notices[-1].number if snapshot.notices else 0
             self.shell = Shell(self._context, snapshot.steps)
@@ -108,6 +104,9 @@ class App:
                 return
             if pages != (pages := [self._context.page_state(role) for role in PAGE_ROLES]):
                 self._version = -1
+            self.operator.watch_previews(
+                bool(self.server.viser.get_clients()) and self.shell.shows_preview
+            )
             try:
                 self._draw()
             except Exception as error:
@@ -132,10 +131,10 @@ class App:
                 self.shell.update(snapshot)
             self._notify(snapshot)
         self._version = snapshot.version
-        if preview and preview.number != self._number:
+        if preview and (preview.number, self.shell.current) != self._number:
             with self._context.lock:
                 self.shell.draw_preview(preview)
-            self._number = preview.number
+            self._number = preview.number, self.shell.current
 
     def _notify(self, snapshot: Snapshot) -> None:
         """Show the gravest of the new notices that the page does not state, and how many more there

@@ -24,7 +24,8 @@ _SATURATED, _DARK = (230, 40, 40), (40, 110, 230)
 _UNLIT = 0.35  # of its brightness
 _GAP_PX = 4
 NEAREST_MM, FARTHEST_MM = 250.0, 1500.0
-_OTHER = "other"
+TURN_DEG = 30.0
+"""Two such scans overlap by more than half."""
 _GIZMO = "simulated object"
 _DETECT = "detect"
 _AUTOMATIC = "by number"
@@ -194,14 +195,18 @@ class SimulatedObject(PanelPart):
         """Create the inputs."""
         with self._gui.add_folder("Simulated rig") as self._folder:
             self._note = Text(self._gui)
-            thing = self.dropdown("Object", (_OTHER, *self._things))
+            self._thing = self.dropdown("Object", self._things)
             self._distance = self.number(
                 "Depth, mm", 600.0, NEAREST_MM, FARTHEST_MM, 5.0, "From the camera"
             )
-            self._turn = self.number("Turn, °", 0.0, -90.0, 90.0, 5.0)
+            self._turn = self.number("Turn, °", 0.0, -180.0, 180.0, 5.0)
+            self._turn_button = self.button(
+                f"Turn by {TURN_DEG:g}°", self._turn_further, "rotate-clockwise",
+                hint="Turns the object to show its next side",
+            )  # fmt: skip
             self._handles = self.checkbox("3D handles", "To move and turn it in the 3D view")
         self._settings = [
-            self.setting(thing, self._request_choice),
+            self.setting(self._thing, self._request_choice),
             self.setting(self._distance, lambda mm: self._move(self._distance, distance_mm=mm)),
             self.setting(self._turn, lambda deg: self._move(self._turn, turn_deg=deg)),
         ]
@@ -218,16 +223,19 @@ class SimulatedObject(PanelPart):
             "" if fits else f"In view: the {world.standing}. Choose an object to capture.",
             "warning",
         )
-        self._distance.disabled = self._turn.disabled = not fits
+        self._distance.disabled = self._turn.disabled = self._turn_button.disabled = not fits
         T = world.T_camera_object
         if fits and self._handles.value:
             self._layer.gizmo(_GIZMO, T, None, self._place)
         else:
             self._layer.remove(_GIZMO)
+        options = self._things if fits else (world.standing, *self._things)
+        if self._thing.options != options:
+            self._thing.options = options
         values = (
-            world.standing if fits else _OTHER,
+            world.standing,
             round(float(np.clip(T[2, 3], NEAREST_MM, FARTHEST_MM)), 1),
-            round(float(np.clip(world.turn_deg, -90, 90)), 1),
+            round(world.turn_deg, 1),
         )
         for setting, value in zip(self._settings, values, strict=True):
             setting.update(value)
@@ -236,6 +244,11 @@ class SimulatedObject(PanelPart):
         """Request that the object in view be moved to T (4, 4) mm."""
         if world := self.panel.snapshot.world:
             self._operator.place(world.standing, T)
+
+    def _turn_further(self) -> None:
+        """Request that the object be turned by one step."""
+        if world := self.panel.snapshot.world:
+            self._operator.move_object(turn_deg=world.turn_deg + TURN_DEG)
 
     def _request_choice(self, thing: Any) -> None:
         """Request that the chosen object be placed in view."""

@@ -53,7 +53,7 @@ COLOURINGS: dict[str, _Colouring] = {
     ERROR: _Colouring(
         kind="error", missing="No errors yet: measure this capture in the step Verify."
     ),
-    DISTANCE: _Colouring("µm", 0, 1000.0, "amount", missing="No two scans lie on each other."),
+    DISTANCE: _Colouring(kind="amount", missing="No two scans lie on each other."),
     SCAN: _Colouring(kind="category", missing=_MERGE_AGAIN),
     SEEN: _Colouring(kind="category", missing=_MERGE_AGAIN),
 }
@@ -129,7 +129,7 @@ def patch(colour: Colour) -> Html:
     return Html(f'<span style="color:rgb{tuple(colour)};font-size:1.3em">■</span>')
 
 
-def format_patches(titles: Sequence[str], palette: Sequence[Colour] = SCAN_COLOURS) -> Html:
+def format_patches(titles: Sequence[str], palette: Sequence[Colour]) -> Html:
     """Return a legend with a coloured square for each title."""
     items = [
         f"<span>{patch(palette[i % len(palette)])} {to_html(title)}</span>"

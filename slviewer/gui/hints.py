@@ -6,7 +6,9 @@ HINTS = MappingProxyType({
     # the frame
     "Autopilot": "Does all steps by itself on the simulated rig; press again to stop",
     "Cancel": "Ends the running capture or job; what was stored stays",
+    "Confirm": "Does it; Restore or Undo brings back what is deleted",
     "Continue": "Shows the next step",
+    "Keep": "Leaves everything as it is",
     "Open session": "Opens the folder as a session, or starts a new one in it",
     "Restore": "Brings back what was deleted last",
     "Undo": "Undoes what was done last",
@@ -30,6 +32,7 @@ HINTS = MappingProxyType({
     "Rows": "Rows of features",
     "Pitch, mm": "Measure it on the print: its error scales all results",
     "Marker, mm": "Side of a marker of the ChArUco board",
+    "First id": "Number of the board's first marker",
     "Dictionary": "ArUco dictionary of the markers",
     "Use this board": "Detects this board in the images from now on",
     # Poses
@@ -65,7 +68,10 @@ HINTS = MappingProxyType({
     "Object": "What stands before the simulated rig",
     "Turn, °": "About the vertical axis",
     "Import folder": "Imports the captures of the folder into this session",
-    "Import files": "Imports captures, clouds, meshes or a calibration; or drop them on the page",
+    "Import files": "Images, zips, clouds, meshes, a calibration; several at once, or dropped",
+    "Import a folder": "Captures as another program saved them; or drop the folder on the page",
+    "From files": "A new session with images, zips, clouds, meshes or a calibration",
+    "From a folder": "A new session with the captures in a folder; or drop it on the page",
     "Upload zip": "Imports the captures of a zip file of your computer",
     # Edit points
     "Select by": "How points are selected in the view",

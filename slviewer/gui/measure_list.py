@@ -27,7 +27,7 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.inspection.deviation import colour_limit
-from slviewer.inspection.features import Feature
+from slviewer.inspection.features import Feature, perpendicular_axes
 from slviewer.inspection.section import (
     CutPlane,
     measure_cursors,
@@ -162,9 +162,7 @@ def _draw_dimension(
 def _draw_circle(centre: np.ndarray, axis: np.ndarray, radius: float) -> np.ndarray:
     """Draw a circle as segments (n, 2, 3) mm around a centre (3,), perpendicular to an axis
     (3,)."""
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
+    first, second = perpendicular_axes(axis)
     t = np.linspace(0, 2 * np.pi, _ROUND + 1)[:, None]
     return _join_segments(centre + radius * (np.cos(t) * first + np.sin(t) * second))
 
@@ -444,7 +442,8 @@ def measurements_table(measured: Sequence[Stored[Measurement]], labels: Mapping[
     # a panel is too narrow for a column of scans
     rows = [[f"{name} on {scan}", what, scan, *rest] for name, what, scan, *rest in listed.rows]
     shown = [column for column in listed.columns if column.title != "scan"]
-    return report_table(replace(listed, rows=rows).select(shown))
+    notes = listed.notes if len(named) > 1 else []  # else they stand beside the only result
+    return report_table(replace(listed, rows=rows, notes=notes).select(shown))
 
 
 def measurement_html(measured: Stored[Measurement], labels: Mapping[str, str]) -> Html:

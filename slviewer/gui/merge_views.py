@@ -12,6 +12,7 @@ import numpy as np
 from slviewer.errors import SlviewerError
 from slviewer.evaluation import letter
 from slviewer.geometry.rigid import move_points
+from slviewer.geometry.vectors import rms
 from slviewer.gui.colouring import (
     DISTANCE,
     SCAN,
@@ -80,7 +81,7 @@ def colour_scans(
     names: Sequence[str],
     places: Mapping[str, np.ndarray],
     titles: Mapping[str, str],
-    colour: str = SCAN,
+    colour: str,
 ) -> ColouredClouds:
     """Load scans, coloured by one of ALIGNED_COLOURINGS, at their ``places`` (4, 4), or as captured
     where they have none."""
@@ -426,9 +427,9 @@ def _residuals_html(picks: _Picks) -> Html:
         _, residuals_mm = fit_picked_start(*picks.points)
     except SlviewerError as error:
         return alert(str(error), "warning")
-    rms = f"RMS {np.sqrt(np.mean(residuals_mm**2)):.2f}"
+    column = f"RMS {rms(residuals_mm):.2f}"
     pairs = [(f"Pair {k}", f"{mm:.2f}") for k, mm in enumerate(residuals_mm, 1)]
-    return table(("Residual, mm", rms), pairs)
+    return table(("Residual, mm", column), pairs)
 
 
 def _load_side_by_side(session: Session, key: _Key) -> _SideBySide:

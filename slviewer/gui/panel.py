@@ -20,7 +20,7 @@ from slviewer.entry_points import PluginGroup
 from slviewer.errors import InputError, SlviewerError, hide_passwords
 from slviewer.gui.hints import HINTS
 from slviewer.gui.scene import Colour, ViewerScene, Viewpoints
-from slviewer.gui.widgets import NOTICES, link, paragraph
+from slviewer.gui.widgets import NOTICES, Text, link, paragraph
 from slviewer.inputs import find_inputs, read_hint
 from slviewer.server.secure import SafeServer
 from slviewer.session.recent import RecentSessions
@@ -76,7 +76,7 @@ class PanelContext:
         self.operator, self.server, self.pages = operator, server, pages
         self.print_links, self.recent = print_links, recent
         self.gui, self.scene = server.viser.gui, ViewerScene(server.viser, self.submit)
-        self.viewpoints = Viewpoints(server.viser)
+        self.viewpoints = Viewpoints(server.viser, self.scene)
         self._pass_on = start_worker("slviewer requests")
         self.lock = threading.RLock()
         self._toasts: dict[int, viser.NotificationHandle] = {}  # the latest of each browser
@@ -85,6 +85,12 @@ class PanelContext:
         """Of all steps; secondary while their step is done, as the next one follows."""
         self.commands: list[viser.CommandHandle] = []
         """Everything that keys do."""
+
+    def show_distance(self, mm: float) -> None:
+        """Draw and show the rig at a working distance, if that is another one altogether."""
+        if not 2 / 3 < mm / self.scene.distance_mm < 1.5:
+            self.scene.set_distance(mm)
+            self.viewpoints.follow_distance()
 
     @property
     def session(self) -> Session:
@@ -478,7 +484,7 @@ class ControlGroup:
     def checkbox(
         self,
         label: str,
-        hint: str | None = None,
+        hint: str | None,
         value: bool = False,
         do: Callable[[bool], Any] | None = None,
     ) -> Any:
@@ -638,6 +644,56 @@ PANEL_PLUGINS = PluginGroup[type[PanelPlugin]](
     type,  # type: ignore[arg-type]
     lambda: (),
 )
+
+
+class ReconstructAllButton(PanelPart):
+    """A button that reconstructs all scans without an up-to-date cloud, while there are any and
+    nothing is computed."""
+
+    def build(self) -> None:
+        """Create the button."""
+        self._button = self.button(
+            "Reconstruct all",
+            self._operator.reconstruct_all,
+            "cube",
+            hint="The scans without a cloud of the present calibration",
+        )
+
+    def draw(self) -> None:
+        """State how many there are."""
+        pending = self.panel.session.pending_scans
+        what = scan_labels(self.panel.session)[pending[0]] if pending else ""
+        self._button.label = f"Reconstruct {f'all {len(pending)}' if pending[1:] else what}"
+        is_calibrated = self.panel.snapshot.step("scan").state != "blocked"
+        self._button.visible = bool(pending) and is_calibrated and not self.panel.snapshot.is_busy
+
+
+class Confirmation(PanelPart):
+    """A question before something that is missed afterwards, hidden until it is asked."""
+
+    _do: Callable[[], Any] | None = None
+
+    def build(self) -> None:
+        """Create text and buttons."""
+        self._text = Text(self._gui)
+        self._confirm = self.button("Confirm", lambda: self._close(True), "check")
+        self._keep = self.button("Keep", lambda: self._close(False), "x")
+        self._close(False)
+
+    def ask(self, question: str, action: str, do: Callable[[], Any]) -> None:
+        """Ask; `do()` is called once the button ``action`` is pressed."""
+        self._do = do
+        self._text.write(question, "warning")
+        self._confirm.label = action
+        self._confirm.visible = self._keep.visible = True
+
+    def _close(self, is_confirmed: bool) -> None:
+        """Hide the question, and do what it asked about where that is confirmed."""
+        do, self._do = self._do, None
+        self._text.set("")
+        self._confirm.visible = self._keep.visible = False
+        if is_confirmed and do:
+            do()
 
 
 class RestoreButton(PanelPart):

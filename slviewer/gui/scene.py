@@ -30,16 +30,19 @@ GHOST: Colour = (20, 160, 220)
 
 SHOWN_POINTS = 150_000
 """Points of one cloud that are sent to a browser: software rendering still moves them smoothly."""
-_FRUSTUM_MM = 60.0
-_FLOOR_MM = 260.0
+USUAL_DISTANCE_MM = 600.0
+"""Working distance of a rig that is not calibrated; all that is drawn beside scans is of a size
+relative to the rig's own."""
+_NEAREST, _FARTHEST = 1 / 300, 100.0
+"""Depths that are drawn, over the view's distance."""
 _FROM = np.array([-0.45, -0.35, -0.82])
 """Viewing direction: from the upper left of the camera, so that depth is visible and nothing is
 upside down."""
 TO_THE_RIGHT = np.cross([0.0, 1.0, 0.0], -_FROM) / np.linalg.norm(_FROM[[0, 2]])
 """(3,): to the right in that view, at the same distance."""
-OVERVIEW = ((-430.0, -560.0, -820.0), (55.0, 40.0, 330.0))
-"""Camera position and target, mm: the rig and objects at its working distance, in a narrow window
-too."""
+_OVERVIEW = np.array([(-0.72, -0.93, -1.37), (0.09, 0.07, 0.55)])
+"""Camera position and target over the working distance: the rig and objects there, in a narrow
+window too."""
 FIELD_OF_VIEW = 0.75  # rad
 
 
@@ -173,7 +176,7 @@ class SceneLayer:
             fov=float(2 * np.arctan2(height / 2, K[1, 1])),
             # of the viewing angles, not of the pixels: a projector's may be far from square
             aspect=float((width / K[0, 0]) / (height / K[1, 1])),
-            scale=_FRUSTUM_MM,
+            scale=self._scene.distance_mm / 10,
             thickness=2.0,
             thickness_units="screen",
             color=colour,
@@ -381,16 +384,22 @@ class ViewerScene:
         self.on_change: Callable[[], None] = lambda: None
         """Called when objects were added, removed, shown or hidden."""
         self._drawn_shape = Text(server.gui)  # read by the page's script
-        api = server.scene
-        api.set_up_direction("-y")
-        api.add_grid(
+        server.scene.set_up_direction("-y")
+        self.set_distance(USUAL_DISTANCE_MM)
+
+    def set_distance(self, mm: float) -> None:
+        """Draw the floor, and devices from now on, for a rig of that working distance."""
+        self.distance_mm = mm
+        cell = 10 ** np.floor(np.log10(mm / 10))  # a round number of mm
+        cell *= 5 if mm >= 50 * cell else 2 if mm >= 20 * cell else 1
+        self._api.add_grid(
             "/floor",
             plane="xz",
-            position=(0.0, _FLOOR_MM, 500.0),
+            position=(0.0, 0.43 * mm, 0.83 * mm),
             infinite_grid=True,
-            cell_size=50.0,
-            section_size=250.0,
-            fade_distance=2500.0,
+            cell_size=cell,
+            section_size=5 * cell,
+            fade_distance=4.2 * mm,
             shadow_opacity=0.0,
         )
 
@@ -506,25 +515,40 @@ def thin(
 
 
 def spacing(points: np.ndarray) -> float:
-    """Estimate the distance, mm, between neighbours of an evenly sampled surface."""
+    """Estimate the distance, mm, between neighbours of an evenly sampled surface; of a few points,
+    a share of their extent."""
     low, high = np.percentile(points, [1, 99], axis=0)
-    sides = np.sort(high - low)
-    return float(np.clip(1.3 * np.sqrt(max(sides[1] * sides[2], 1e-6) / len(points)), 0.05, 20.0))
+    _, middle, longest = np.sort(high - low)
+    even = 1.3 * np.sqrt(middle * longest / len(points))
+    return float(np.clip(even, 1e-4 * longest, 0.05 * longest)) or 1.0
 
 
 class Viewpoints:
     """Moves the views of all browsers of a server; a new cloud is shown in every view."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
+    def __init__(self, server: viser.ViserServer, scene: ViewerScene) -> None:
+        self._server, self._scene = server, scene
         self._shown = ""
+        server.initial_camera.fov = FIELD_OF_VIEW
+        self.follow_distance()
+
+    def follow_distance(self) -> None:
+        """Show the rig at the scene's working distance, unless a cloud is shown, also to browsers
+        that come later."""
+        set_view(self._server.initial_camera, *_OVERVIEW * self._scene.distance_mm)
+        if not self._shown:
+            self._show_rig()
 
     def overview(self) -> None:
         """Show the whole rig again, if a cloud was shown."""
         if self._shown:
             self._shown = ""
-            for client in self._server.get_clients().values():
-                _set_view(client, *(np.array(each) for each in OVERVIEW))
+            self._show_rig()
+
+    def _show_rig(self) -> None:
+        """Move all views to the rig."""
+        for client in self._server.get_clients().values():
+            _set_client_view(client, *_OVERVIEW * self._scene.distance_mm)
 
     def show(self, name: str, points: np.ndarray | None) -> None:
         """Move all views to the points (..., 3) mm, unless those of the same `name` are shown
@@ -542,7 +566,7 @@ def _look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
     flat = flat[np.isfinite(flat[:, 2])]
     if len(flat):
         size = _relative_size(client.camera)
-        _set_view(client, *frame_points(flat, client.camera.aspect, size))
+        _set_client_view(client, *frame_points(flat, client.camera.aspect, size))
 
 
 def frame_points(
@@ -553,7 +577,7 @@ def frame_points(
     low, high = np.percentile(thin_out(points, 20_000), [2, 98], axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     # the field of view is that of the height
-    away = max(1.45 * size * max(1.0, 0.85 / aspect), 50.0)
+    away = 1.45 * size * max(1.0, 0.85 / aspect) or 50.0  # of a single point
     return middle + _FROM * away / relative_size, middle
 
 
@@ -563,11 +587,20 @@ def _relative_size(camera: viser.CameraHandle) -> float:
     return float(np.tan(camera.fov / 2) / np.tan(FIELD_OF_VIEW / 2))
 
 
-def _set_view(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
-    """Set one browser's camera position and target (3,) mm."""
+def set_view(
+    camera: viser.CameraHandle | viser.InitialCameraConfig, position: np.ndarray, at: np.ndarray
+) -> None:
+    """Set a camera's position and target (3,) mm, and the depths that it shows."""
+    camera.position = tuple(position)  # this also moves the target
+    camera.look_at = tuple(at)
+    away = float(np.linalg.norm(at - position))
+    camera.near, camera.far = _NEAREST * away, _FARTHEST * away
+
+
+def _set_client_view(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
+    """Set one browser's view, as `set_view` does."""
     with client.atomic():
         # viser sends no view that it takes for the browser's own, which a slow browser has already
         # been sent away from: one beside it is always sent
-        client.camera.position = tuple(position + 1.0)
-        client.camera.position = tuple(position)  # this also moves the target
-        client.camera.look_at = tuple(at)
+        client.camera.position = tuple(2 * position - at)
+        set_view(client.camera, position, at)

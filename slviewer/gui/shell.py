@@ -24,8 +24,8 @@ from slviewer.gui.panel import (
     PanelContext,
     StepPanel,
 )
-from slviewer.gui.scene import CAMERA, PROJECTOR, SceneLayer
-from slviewer.gui.start import START, StartPanel
+from slviewer.gui.scene import CAMERA, PROJECTOR, USUAL_DISTANCE_MM, SceneLayer
+from slviewer.gui.start import A_FOLDER, IMPORTED, START, StartPanel
 from slviewer.gui.undo_controls import UndoControls
 from slviewer.gui.widgets import (
     NOTICES,
@@ -43,9 +43,7 @@ from slviewer.gui.widgets import (
 )
 from slviewer.records.record import format_counts
 from slviewer.session.atomic import format_bytes
-from slviewer.session.importers.clouds import FORMATS
 from slviewer.wizard.autopilot import Autopilot
-from slviewer.wizard.operator import CALIBRATIONS
 from slviewer.wizard.snapshot import (
     CalibrationView,
     Notice,
@@ -55,6 +53,7 @@ from slviewer.wizard.snapshot import (
     Snapshot,
     StepView,
 )
+from slviewer.wizard.steps import describe_awaited, list_activities
 
 _EYES = {True: viser.Icon.EYE, False: viser.Icon.EYE_OFF}
 
@@ -124,8 +123,6 @@ _STEP_COLOURS: dict[str, Literal["green", "orange", "gray"]] = {
 }
 """Of the icons, by `page_style.css`; the shown step's button has the accent colour."""
 _STEPS_WITH_RIG = ("rig", "target", "poses", "calibrate")  # in which the devices matter in 3D
-DROPPED = ",".join((".zip", *FORMATS, *CALIBRATIONS))
-"""Files that are imported; the page hands its input for these what is dropped on it."""
 STAGES = {
     "rig": "check-of-the-rig",
     "target": "target-poses",
@@ -156,6 +153,8 @@ class Shell(ControlGroup):
         self._panels: dict[str, StepPanel] = {}
         self._shown_key = self._autopilot_key = self._following_key = ""
         self._folder: Path | None = None
+        self._drawn = Snapshot()
+        self._hands_free_awaits = ""
         self.current = START
         """The step that is shown, or will be with the next drawing."""
         self._gui.set_panel_label("slviewer")
@@ -197,10 +196,12 @@ class Shell(ControlGroup):
             "Autopilot", self._toggle_autopilot, "player-play", at_once=True
         )
         self._autopilot.visible = False
-        self.upload_button("Import files", self._operator.import_file, DROPPED)
+        with gui.add_folder(None) as self._imports:
+            for label, kinds in (("Import files", IMPORTED), ("Import a folder", A_FOLDER)):
+                self.upload_button(label, self._operator.import_file, kinds)
         self._counts = Text(gui)
         self._undo = UndoControls(self.context)
-        self._busy = Text(gui)
+        self._state = Text(gui)
 
     def _build_right(self, steps: Sequence[StepView]) -> None:
         """Build the right panel: the shown step with its problems and progress; the session; the
@@ -213,7 +214,6 @@ class Shell(ControlGroup):
             self._heading = Text(gui)
             self._faults = Text(gui)
             self._autopilot_status = Text(gui)
-            self._progress = Text(gui)
             self._cancel = self.button("Cancel", operator.cancel, "player-stop", at_once=True)
             self._next = self.button(
                 "Continue", lambda: self.go(self._following_key), "arrow-right"
@@ -257,6 +257,7 @@ class Shell(ControlGroup):
         key = self.current
         if key != self._shown_key:
             self._switch_panel(key)
+        self._imports.visible = key != START  # which has its own
         self._start_button.color = None if key == START else "gray"
         for step in snapshot.steps:
             button = self._step_buttons[step.key]
@@ -264,7 +265,8 @@ class Shell(ControlGroup):
             button.icon = viser.IconName(_ICONS[state])
             button.color = None if step.key == key else _STEP_COLOURS[state]
         self._draw_heading(snapshot)
-        self._draw_progress(snapshot)
+        self._drawn = snapshot
+        self._draw_state()
         self._draw_session(snapshot)
         self._undo.update(snapshot)
         self._draw_devices(snapshot.calibration, snapshot.rig)
@@ -274,6 +276,14 @@ class Shell(ControlGroup):
         """Show a preview, if the current step shows one."""
         if self._shown_key:
             self._panels[self._shown_key].draw_preview(preview)
+        if preview.awaited != self._hands_free_awaits:
+            self._hands_free_awaits = preview.awaited
+            self._draw_state()
+
+    @property
+    def shows_preview(self) -> bool:
+        """Whether the current step shows previews."""
+        return type(self._panels[self.current]).draw_preview is not StepPanel.draw_preview
 
     @property
     def needs_drawing(self) -> bool:
@@ -322,38 +332,28 @@ class Shell(ControlGroup):
         problems = (
             Html(f"{to_html(each)} {help_link(STAGES[step.key])}") for each in step.problems
         )
-        self._heading.set(
-            heading
-            + alert(step.blocked_by, "warning")
-            + "".join(alert(problem, "error") for problem in problems)
-        )
+        self._heading.set(heading + "".join(alert(problem, "error") for problem in problems))
         following = steps[at + 1] if at + 1 < len(steps) else None
         if following:
             self._following_key = following.key
             self._next.label = f"Continue to {following.title}"
-        leads_on = bool(following and following.state != "blocked" and step.state == "done")
-        self._next.visible = leads_on
+        can_continue = following is not None and following.state != "blocked"
+        leads_on = can_continue and step.state == "done"
+        self._next.visible = leads_on or step.key == "verify"  # which is optional
         for button in self.context.main_buttons:
             button.color = "gray" if leads_on else None
 
-    def _draw_progress(self, snapshot: Snapshot) -> None:
-        """Show the progress of capture and job, and whether it can be cancelled."""
-        work, preparing = _running_work(snapshot), ""
-        progress = "".join(_progress_html(*each) for each in work)
-        self._progress.set(progress)
+    def _draw_state(self) -> None:
+        """Show what runs and what is awaited, and whether it can be cancelled."""
+        snapshot, key = self._drawn, self._shown_key
+        activities = list_activities(snapshot)
+        if key != START:
+            awaited = describe_awaited(snapshot, key, self._hands_free_awaits)
+        else:
+            awaited = "" if activities else "Waits for you: open a session, or make a new one."
+        self._state.set(state_html(activities, awaited))
         job = snapshot.job
-        can_cancel = snapshot.rig.capture is not None or bool(job and job.can_cancel)
-        self._cancel.visible = bool(work) and can_cancel
-        # repeated on the left: it must not scroll out of view, nor move what is about to be clicked
-        if snapshot.preparing is not None:
-            text = (
-                f"Preparing, {100 * snapshot.preparing:.0f} %: compiling for this computer, once;"
-            )
-            preparing = _progress_html(
-                f"{text} the first pose and calibration wait for it", snapshot.preparing
-            )
-        idle = note(f"{job.stage or job.name} …" if job else "Idle")
-        self._busy.set(progress + preparing or idle)
+        self._cancel.visible = snapshot.rig.capture is not None or bool(job and job.can_cancel)
 
     def _draw_session(self, snapshot: Snapshot) -> None:
         """Show the session's folder, contents and free space, the autopilot and the latest
@@ -361,12 +361,12 @@ class Shell(ControlGroup):
         session, space = snapshot.session, snapshot.space
         if session is None:
             about = note("No session is open.")
-            self._counts.set(about)
+            self._counts.set(f"<div data-counts>{about}</div>")
         else:
             kinds = ["pose"] * len(session.poses) + [scan.purpose for scan in session.scans]
             name = f'<b style="overflow-wrap:anywhere">{to_html(session.folder.name)}</b>'
             lines = [name, format_counts(kinds)]
-            self._counts.set(paragraph(Html("<br>".join(lines))))
+            self._counts.set(f"<div data-counts>{paragraph(Html('<br>'.join(lines)))}</div>")
             folder = f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}'
             lines.insert(1, f"{folder}</span>")
             if space:
@@ -402,6 +402,7 @@ class Shell(ControlGroup):
         self._drawn_devices = (calibration, camera)
         self._devices.clear()
         rig = calibration.stereo.rig if calibration else None
+        self.context.show_distance(_estimate_distance(calibration))
         if camera:
             K = (rig.camera if rig else nominal_lens(camera)).K
             self._devices.device("camera", K, camera, np.eye(4), CAMERA)
@@ -425,6 +426,14 @@ class Shell(ControlGroup):
             self._operator.cancel()
         else:
             self._operator.start_autopilot(Autopilot(self._operator, pause_s=0.5))
+
+
+def _estimate_distance(calibration: CalibrationView | None) -> float:
+    """Return the working distance of a rig in mm."""
+    if calibration is None:
+        return USUAL_DISTANCE_MM
+    depths = calibration.stereo.depth_range_mm  # unknown where it was imported
+    return float(np.mean(depths)) if depths else 3.3 * calibration.stereo.rig.baseline_mm
 
 
 def _describe_state(step: StepView) -> str:
@@ -470,25 +479,18 @@ def _object_step(session: SessionView) -> str:
     return "export" if measured else "measure"
 
 
-def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
-    """List (description, share done) of the running capture and of the requested job."""
-    job, capture, work = snapshot.job, snapshot.rig.capture, []
-    if capture:
-        waiting = f", {capture.waiting} waiting" if capture.waiting else ""
-        text = f"Capturing {capture.name}: frame {capture.frame} of {capture.frames}{waiting}"
-        if capture.stage:
-            text = f"{capture.name}: {capture.stage}{waiting}"
-        work.append((text, capture.frame / max(capture.frames, 1)))
-    if job and not job.background:
-        waiting = f", {job.waiting} waiting" if job.waiting else ""
-        stage = job.stage or "starting"
-        work.append((f"{job.name}: {stage}{waiting} ({job.seconds:.0f} s)", job.share))
-    return work
-
-
-def _progress_html(text: str, share: float) -> Html:
-    """Return a line about running work, with a bar that is filled to the share done."""
-    return paragraph(Html(f"{to_html(text)}{meter(share)}"))
+def state_html(activities: Sequence[tuple[str, float | None]], awaited: str) -> Html:
+    """Return the line of state: what runs, with bars that are filled to the shares done, and what
+    is awaited; `page_style.css` puts it below everything."""
+    parts = []
+    for text, share in activities:
+        bar = "" if share is None else meter(share)
+        parts.append(f"{bar}<b>{to_html(text)}</b>")
+    if awaited:
+        parts.append(to_html(awaited))
+    parts = [f"<span>{part}</span>" for part in parts]
+    kind = "busy" if activities else "waiting"
+    return Html(f'<div data-activity="{kind}" role="status">{"".join(parts)}</div>')
 
 
 def show_links(context: PanelContext, client: viser.ClientHandle | None) -> None:

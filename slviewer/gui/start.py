@@ -17,10 +17,19 @@ from slviewer.gui.widgets import (
     thumbnail,
     to_html,
 )
+from slviewer.session.importers.clouds import FORMATS
+from slviewer.session.importers.images import IMAGE_SUFFIXES
+from slviewer.session.names import folder_name
 from slviewer.session.recent import MOST_RECENT, new_session_folder, sessions_folder
+from slviewer.wizard.operator import CALIBRATIONS
 from slviewer.wizard.session_reader import SessionOverview, read_overview
 
 START = "start"
+IMPORTED = ",".join((".zip", *FORMATS, *CALIBRATIONS, *sorted(IMAGE_SUFFIXES)))
+"""Files that are imported; the page hands its first input for these what is dropped on it, and
+makes a zip of images, of several files and of a folder."""
+A_FOLDER = IMPORTED + ",folder"
+"""Of an input whose dialog takes a folder, by `page_script.js`."""
 _PICTURE_PX = 96
 _VERDICTS: dict[str, tuple[str, Tone]] = {
     "good": ("Calibration good", "good"),
@@ -81,13 +90,17 @@ class StartPanel(StepPanel):
         self._fault = Text(gui)
         self._name: Any = gui.add_text("Name", "", hint=f"Of a new folder in {sessions_folder()}")
         self.button("New session", self._make_new, "plus", None)
+        for label, kinds in (("From files", IMPORTED), ("From a folder", A_FOLDER)):
+            self.upload_button(label, self._make_from_files, kinds)
         with gui.add_folder("Recent sessions") as self._recent_folder:
             Text(gui).write("Duplicate: a new session with the same calibration.", "dim")
             self._rows = [RecentSession(self) for _ in range(MOST_RECENT)]
             self._restore = self.button("Restore", self.context.recent.restore, "arrow-back-up")
         with gui.add_folder("Another folder", expand_by_default=False):
             folder = gui.add_text("Folder", "", hint="Of a session; created if it does not exist")
-            self.button("Open session", lambda: self.open_session(folder.value), "folder-open")
+            self.button(
+                "Open session", lambda: self.open_session(folder.value.strip()), "folder-open"
+            )
 
     def draw(self) -> None:
         """Show the recent sessions, read anew after each change."""
@@ -137,12 +150,20 @@ class StartPanel(StepPanel):
         place = self.context.recent.trash(folder)
         self._operator.notify("info", f"{folder.name} was moved to {place}")
 
-    def _make_new(self) -> None:
-        """Request a new session of the entered name, by default today's."""
+    def _make_new(self) -> bool:
+        """Request a new session of the entered name, by default today's; returns whether it is
+        open."""
         name = self._name.value.strip()
-        folder = sessions_folder() / name if name else new_session_folder()
-        if self._operator.open_session(folder, is_new=True):
+        folder = sessions_folder() / folder_name(name) if name else new_session_folder()
+        is_open = self._operator.open_session(folder, is_new=True)
+        if is_open:
             self._opened()
+        return is_open
+
+    def _make_from_files(self, name: str, content: bytes) -> None:
+        """Request a new session, and the import of a file or a zip of files into it."""
+        if self._make_new():
+            self._operator.import_file(name, content)
 
 
 def overview_html(overview: SessionOverview) -> Html:

@@ -50,11 +50,11 @@ class UndoControls(ControlGroup):
         """Show the keys that do something now, and what the mouse does, in one browser."""
         if client is None:
             return
-        rows = [
-            (format_key(str(each.hotkey), each.modifier), each.label)
-            for each in self.context.commands
-            if not each.disabled
-        ]
+        keys: dict[str, list[str]] = {}
+        for each in self.context.commands:
+            if not each.disabled:
+                keys.setdefault(each.label, []).append(format_key(str(each.hotkey), each.modifier))
+        rows = [(" or ".join(dict.fromkeys(names)), label) for label, names in keys.items()]
         with client.gui.add_modal("Keys and mouse") as dialog:
             client.gui.add_html(str(table(("Key", ""), [*rows, *_VIEW.items()], ("left", "left"))))
             client.gui.add_button("Close", color="gray", hint="Closes this dialog").on_click(

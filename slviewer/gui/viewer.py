@@ -20,8 +20,9 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import finite_rows
 from slviewer.gui.colouring import shade
-from slviewer.gui.scene import FIELD_OF_VIEW, add_points, frame_points, thin
+from slviewer.gui.scene import FIELD_OF_VIEW, add_points, frame_points, set_view, thin
 from slviewer.pipeline.measure import MeasuredSurface, load_surface
 from slviewer.pipeline.operation import Job, opened
 from slviewer.reconstruction.cloud import Cloud
@@ -99,7 +100,7 @@ def show(what: Any, name: str = "", *, open_browser: bool | None = None) -> View
     """
     shape = _find_shape(what, name)
     points = shape.points.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     if not len(points):
         raise InputError("No valid point to show", "give a cloud with measured points.")
     viser_internals.check_version()
@@ -107,8 +108,7 @@ def show(what: Any, name: str = "", *, open_browser: bool | None = None) -> View
     server.gui.configure_theme(control_layout="floating")
     server.scene.set_up_direction("-y")
     server.initial_camera.fov = FIELD_OF_VIEW
-    server.initial_camera.position, server.initial_camera.look_at = frame_points(points, 1.6)
-    server.initial_camera.near, server.initial_camera.far = 1.0, 50_000.0
+    set_view(server.initial_camera, *frame_points(points, 1.6))
     _draw(server.scene, shape)
     viewer = Viewer(server)
     if open_browser if open_browser is not None else not _in_notebook():

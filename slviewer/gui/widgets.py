@@ -22,6 +22,7 @@ from scipy.io import wavfile
 from slviewer.errors import hide_passwords
 from slviewer.geometry.vectors import thin_out
 from slviewer.pipeline.operation import Stored, name_records
+from slviewer.printable import capitalize
 from slviewer.records.record import Column, Mark, Table, relabel
 from slviewer.report.page import Figure
 from slviewer.server.help_pages import PREFIX
@@ -130,7 +131,7 @@ def table(
     titles: Sequence[object], rows: Sequence[Sequence[object]], aligned: Sequence[str] = ()
 ) -> Html:
     """Return a table: by default the first column left-aligned, the others right-aligned. Lines
-    break between words alone, where the panel is too narrow."""
+    break between words alone, where the panel is too narrow. A row of one cell spans the table."""
 
     is_wide = len(titles) > _ROOMY_COLUMNS
     gap = 0.35 if is_wide else 0.6
@@ -138,17 +139,21 @@ def table(
     def line(tag: str, cells: Sequence[object], style: str) -> str:
         """Return one row of cells with this HTML tag and style."""
         sides = aligned or ["left", *["right"] * (len(cells) - 1)]
+        span = f' colspan="{len(titles)}"' if len(cells) == 1 else ""
         return "".join(
-            f'<{tag} style="text-align:{side};padding:0.2em 0 0.2em'
-            f' {gap * (k > 0):g}em;{style}">{to_html(c)}</{tag}>'
-            for k, (side, c) in enumerate(zip(sides, cells, strict=True))
+            f'<{tag}{span} style="text-align:{side};padding:0.2em 0 0.2em'
+            f' {gap * (k > 0):g}em;{style}">{_break_names(c)}</{tag}>'
+            for k, (side, c) in enumerate(zip(sides, cells, strict=bool(cells[1:])))
         )
 
     head = line("th", titles, f"color:{TONES['dim']};font-weight:600;vertical-align:bottom")
-    rule = (
-        "border-top:1px solid var(--mantine-color-default-border);font-variant-numeric:tabular-nums"
+    under = "font-variant-numeric:tabular-nums"
+    rule = f"border-top:1px solid var(--mantine-color-default-border);{under}"
+    body = "".join(
+        # what follows a row that spans the table belongs to it
+        f"<tr>{line('td', row, rule if k == 0 or len(rows[k - 1]) > 1 else under)}</tr>"
+        for k, row in enumerate(rows)
     )
-    body = "".join(f"<tr>{line('td', row, rule)}</tr>" for row in rows)
     style = "width:100%;border-collapse:collapse"
     if is_wide:
         style += ";font-size:0.9em"
@@ -177,25 +182,41 @@ def record_properties(title: object, shown: Table) -> Html:
 
 def _format_title(column: Column) -> str:
     """Return a column's title with its unit."""
-    return f"{column.title[:1].upper()}{column.title[1:]}{column.unit and f', {column.unit}'}"
+    return capitalize(column.title) + (column.unit and f", {column.unit}")
 
 
 def report_table(shown: Table) -> Html:
-    """Return a table of figures without its details, with its notes."""
+    """Return a table of figures without its details, with its notes. Names in front of other names
+    and many columns stand in rows of their own."""
     tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
     shown = shown.without_details()
     # a line ends between words, in any font
     titles = [_format_title(each).replace("-", NO_BREAK_HYPHEN) for each in shown.columns]
     rows = [
         [
-            coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))
+            coloured(
+                _break_names(text), tones.get(mark, "plain"), bold=mark in ("better", "strong")
+            )
             for _, text, mark in line
         ]
         for line in shown.format([*shown.rows, *shown.footer])
     ]
+    is_named_twice = [column.align for column in shown.columns[:2]] == ["left", "left"]
+    if len(titles) >= _ROOMY_COLUMNS and is_named_twice:
+        titles = [f"{titles[0]} / {titles[1][:1].lower()}{titles[1][1:]}", *titles[2:]]
+        rows = [
+            each
+            for name, *rest in rows
+            for each in (*([[Html(f"<b>{name}</b>")]] if to_html(name) else []), rest)
+        ]
     caption = paragraph(coloured(shown.caption, "plain", bold=True))
-    aligned = [column.align for column in shown.columns]
+    aligned = [column.align for column in shown.columns][-len(titles) :]
     return caption + table(titles, rows, aligned) + "".join(map(note, shown.notes))
+
+
+def _break_names(text: object) -> Html:
+    """Return text whose lines may break behind the underscores of names; HTML stays as it is."""
+    return text if isinstance(text, Html) else Html(to_html(text).replace("&#95;", "&#95;<wbr>"))
 
 
 def records_html(
@@ -439,6 +460,8 @@ def colour_range(values: NDArray[np.floating]) -> tuple[float, float]:
 
 
 _DETECTED, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
+_UNCHANGING = (128, 128, 128)
+_STRIPE_PX = 6
 
 
 class LiveImage(Picture):
@@ -474,15 +497,17 @@ class LiveImage(Picture):
         preview: PreviewView,
         board: Board | None,
         ghost_px: np.ndarray | None = None,
+        image: np.ndarray | None = None,
         *,
         is_wanted: bool = True,
     ) -> None:
-        """Show a frame with the detected board, and where to hold it next; a board that is not
-        `is_wanted` is not missed."""
+        """Show a frame with the detected board, where to hold it next, and the pixels outside
+        `image`; a board that is not `is_wanted` is not missed."""
         hint = "" if ghost_px is None else "Dashed blue: hold the board here"
         found = board_html(preview, board, is_wanted)
-        lines = found, exposure_html(preview), coloured(hint, "info")
-        self._show(preview, draw_preview(preview, board, ghost_px), *lines)
+        hidden = "" if image is None or image.all() else "Striped: no light changes these pixels"
+        lines = found, exposure_html(preview), coloured(hint, "info"), coloured(hidden, "info")
+        self._show(preview, draw_preview(preview, board, ghost_px, image), *lines)
 
     def _show(self, preview: PreviewView, picture: np.ndarray, *lines: Html) -> None:
         """Show the picture of a frame, with lines below; what is drawn states the camera's width
@@ -492,22 +517,32 @@ class LiveImage(Picture):
         self.set(picture, legend(preview, *lines))
 
 
+def _fit_mask(mask: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """Return a mask of a frame (h, w) at the size of its picture."""
+    size = picture.shape[1::-1]
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
 def draw_preview(
-    preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None
+    preview: PreviewView,
+    board: Board | None = None,
+    ghost_px: np.ndarray | None = None,
+    image: np.ndarray | None = None,
 ) -> np.ndarray:
     """Draw the frame (h, w, 3) uint8 with saturated pixels, the detected board and the suggested
     outline marked; a second camera's frame beside it.
 
     The board's features are joined row by row; `ghost_px` is the outline (4, 2) of the suggested
-    pose, in camera px.
+    pose, in camera px; what light never changes, outside ``image`` (h, w) bool, is hatched.
     """
     picture = fitted(preview.image)
     clipped = preview.image >= 255
     if clipped.any():
-        mask = cv2.resize(
-            clipped.astype(np.uint8), picture.shape[1::-1], interpolation=cv2.INTER_NEAREST
-        )
-        picture[mask > 0] = _CLIPPED
+        picture[_fit_mask(clipped, picture)] = _CLIPPED
+    if image is not None and not image.all():
+        rows, columns = map(np.arange, picture.shape[:2])
+        stripes = np.add.outer(rows, columns) // _STRIPE_PX % 2 > 0
+        picture[_fit_mask(~image, picture) & stripes] = _UNCHANGING
     to_picture = preview.scale * PICTURE_PX / preview.image.shape[1]
     if ghost_px is not None and np.isfinite(ghost_px).all():
         _draw_dashed_outline(picture, ghost_px * to_picture)
@@ -534,7 +569,7 @@ def exposure_html(preview: PreviewView) -> Html:
     return coloured(f"Well exposed, peak at {100 * preview.brightest:.0f} %", "good")
 
 
-def board_html(preview: PreviewView, board: Board | None, is_wanted: bool = True) -> Html:
+def board_html(preview: PreviewView, board: Board | None, is_wanted: bool) -> Html:
     """Describe whether the board is detected, or why not, as a fault while it `is_wanted`."""
     if board is None:
         return coloured("No board is chosen", "dim")
@@ -542,14 +577,16 @@ def board_html(preview: PreviewView, board: Board | None, is_wanted: bool = True
         return coloured("No board in view", "dim")
     if preview.board is None:
         missing = preview.missing or "searching for the board …"
-        return coloured(f"{missing[:1].upper()}{missing[1:]}", "warning")
+        return coloured(capitalize(missing), "warning")
     detected, total = len(preview.board.pixels), len(board.points)
     return coloured(f"Board detected: {detected} of {total} features", "good")
 
 
 def legend(preview: PreviewView, *lines: Html) -> Html:
     """Return lines below the image, the frame rate beside the first."""
-    rate = coloured(f"{preview.frames_per_s:.0f} frames/s", "dim")
+    per_s = preview.frames_per_s
+    # a still image is not grabbed again
+    rate = coloured(f"{per_s:.0f} frames/s", "dim") if per_s >= 1 else Html("")
     first = (
         '<div style="display:flex;justify-content:space-between;gap:1em">'
         f'<span>{lines[0]}</span><span style="white-space:nowrap">{rate}</span></div>'

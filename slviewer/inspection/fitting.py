@@ -298,10 +298,15 @@ def _describe_fit(
             isolated=membership.isolated[:count],
             beside=membership.beside[:count],
         ).describe_excluded()
+    if membership is not None and (deviating or membership.doubtful.any()):
+        # least squares of these points too would take these steps; apart by sides, as what is
+        # taken for the feature's own by mistake must not balance what is
+        far, J = membership.deviates | membership.doubtful, feature.jacobian(every)
+        near = belongs & ~far
+        sides = [near | (far & (side * residuals > 0)) for side in (1, -1)]
+        steps = np.array([np.linalg.lstsq(J[k], -residuals[k], rcond=None)[0] for k in sides])
+        spread = replace(spread, scatter=spread.scatter + steps.T @ steps, form=steps)
     if deviating:
-        # least squares of these points too would take this step
-        step = np.linalg.lstsq(feature.jacobian(every[belongs]), -residuals[belongs], rcond=None)[0]
-        spread = replace(spread, scatter=spread.scatter + np.outer(step, step))
         farthest = float(np.abs(residuals[membership.deviates]).max())  # type: ignore[union-attr]
         warnings.append(
             f"{100 * deviating / len(every):.2g} % of the points lie off the {kind}, over its own"
@@ -548,7 +553,7 @@ def datum_spread(fits: Sequence[FeatureFit], middle: Floats) -> Uncertainty:
     features = [fit.feature for fit in fits]
     T = datum_frame(features)
     back = np.linalg.inv(T)
-    covariance = np.zeros((6, 6))
+    covariance, noise = np.zeros((2, 6, 6))
     for k, fit in enumerate(fits):
         columns = []
         for each in np.eye(fit.feature.parameters):
@@ -562,7 +567,8 @@ def datum_spread(fits: Sequence[FeatureFit], middle: Floats) -> Uncertainty:
             columns.append(np.concatenate([turn / 2, shift]) / step)
         J = np.array(columns).T
         covariance += J @ fit.spread.covariance @ J.T
-    return Uncertainty(covariance, middle)
+        noise += J @ fit.spread.noise.covariance @ J.T
+    return Uncertainty(covariance, middle, noise)
 
 
 def face_towards(fit: FeatureFit, side: Floats) -> FeatureFit:
@@ -575,5 +581,7 @@ def face_towards(fit: FeatureFit, side: Floats) -> FeatureFit:
     sign = np.array([1.0, -1.0, -1.0])
     spread = fit.spread
     shared = None if spread.shared is None else spread.shared * sign
-    turned = Spread(spread.scatter * np.outer(sign, sign), shared, spread.calibration)
+    form = None if spread.form is None else spread.form * sign
+    scatter = spread.scatter * np.outer(sign, sign)
+    turned = replace(spread, scatter=scatter, shared=shared, form=form)
     return replace(fit, feature=replace(f, direction=-f.unit_direction), spread=turned)

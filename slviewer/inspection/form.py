@@ -33,10 +33,12 @@ from slviewer.inspection.membership import find_isolated
 from slviewer.inspection.uncertainty import (
     DRAWS,
     Shared,
+    Spread,
     draw_motions,
     draw_steps,
     joint_covariance,
 )
+from slviewer.records.acceptance import COVERAGE
 from slviewer.records.measurement import Quantity
 
 FormKind = Literal["flatness", "roundness", "cylindricity"]
@@ -51,6 +53,10 @@ that are averaged."""
 FINE_POINTS, FINE_SIGMA = (6, 24), 5.0
 """Neighbours whose mean deviation is tested for form that is too fine for the smooth part, and
 standard deviations of that mean from which on it is form."""
+NOISE_SIGMAS = 2.5
+"""By so much noise may enlarge the deviation of a single point of a fine defect."""
+HIDDEN_SHARE = 0.01
+"""Of a feature: a defect of such an area is meant to be seen."""
 FINE_SHARE = 0.25
 """Standard uncertainty of a fine defect, as a share of it: it seldom fills its neighbourhood."""
 SPAN_RATIO = 1e-4
@@ -101,6 +107,16 @@ def smallest_defect(points: Floats, deviations: Floats) -> float:
     _, near = cKDTree(points).query(points, k=2)
     noise = robust_sigma(deviations - deviations[near[:, 1]], about=0.0) / np.sqrt(2)
     return float(FINE_SIGMA * noise / np.sqrt(FINE_POINTS[0]))
+
+
+def hidden_defect(smallest: float, count: int) -> float:
+    """Depth, mm, of a defect on `HIDDEN_SHARE` of a feature that the noise among its ``count``
+    points hides in less than 2.5 % of scans, from the `smallest_defect` that half of them show; 0
+    where enough lie there."""
+    least, most = FINE_POINTS
+    there = HIDDEN_SHARE * count
+    surely = (FINE_SIGMA + COVERAGE) / FINE_SIGMA
+    return smallest * surely * float(np.sqrt(least / max(there, least))) if there < most else 0.0
 
 
 def smooth_deviations(
@@ -185,7 +201,8 @@ def zone_width(
         drawn = drawn + displaced(smooth.points[chosen], smooth.normals[chosen])
     widths = width(drawn, smooth.points[chosen])
     value = float(width(field[:, None], smooth.points)[0])
-    variance = float(widths.var()) + (FINE_SHARE * float(np.abs(smooth.fine).max())) ** 2
+    finer = width((field + FINE_SHARE * smooth.fine)[:, None], smooth.points)[0]
+    variance = float(widths.var()) + float(finer - value) ** 2
     if shared is not None:
         # where the zone touches, its width answers to the deviations there; the rest of the field
         # leaves it unchanged
@@ -336,12 +353,6 @@ def position_error(
     if f.direction is not None:
         along = (points - f.place) @ f.direction
         reached = np.array([along.min(), along.max()])[:, None] * f.direction
-    rng = np.random.default_rng(2)
-    shifts = np.zeros((DRAWS, len(reached), 3))
-    if alignment is not None:
-        shifts = draw_motions(alignment, rng)(f.place + reached)
-    steps = draw_steps(fit.spread.covariance, rng)
-
     place_or_axis = replace(nominal, radius=None)
 
     def off(feature: Feature, moved: Floats | float) -> float:
@@ -352,8 +363,20 @@ def position_error(
             places = places + (reached @ f.unit_direction)[:, None] * turned
         return 2 * float(np.abs(place_or_axis.distance(places)).max())
 
-    drawn = np.array([off(f.moved(step), shift) for step, shift in zip(steps, shifts, strict=True)])
-    return _correct_for_noise("position", off(f, 0.0), drawn, fit.spread.whole)
+    def draw(spread: Spread, motion: Uncertainty | None) -> Floats:
+        """Return the position with each of the drawn errors (draws,)."""
+        rng = np.random.default_rng(2)
+        shifts = np.zeros((DRAWS, len(reached), 3))
+        if motion is not None:
+            shifts = draw_motions(motion, rng)(f.place + reached)
+        steps = draw_steps(spread.covariance, rng)
+        return np.array([off(f.moved(each), s) for each, s in zip(steps, shifts, strict=True)])
+
+    noisy = alignment
+    if alignment is not None and alignment.noise is not None:
+        noisy = replace(alignment, covariance=alignment.noise)
+    drawn = draw(fit.spread.noise, noisy), draw(fit.spread, alignment)
+    return _correct_for_noise("position", off(f, 0.0), *drawn, fit.spread.whole)
 
 
 def profile_error(
@@ -393,16 +416,20 @@ def _twice_largest(deviations: Floats, points: Floats) -> Floats:
     return 2 * np.abs(deviations).max(axis=0)
 
 
-def _correct_for_noise(name: str, value: float, drawn: Floats, whole: bool) -> Quantity:
+def _correct_for_noise(
+    name: str, value: float, drawn: Floats, shifted: Floats, whole: bool
+) -> Quantity:
     """Return a width (mm) less what noise adds to it, with that and the spread of the draws in U.
 
     The measured width holds noise once, the ``drawn`` ones (draws,) twice: they are extrapolated to
-    none by a line (SIMEX, Cook and Stefanski 1994).
+    none by a line (SIMEX, Cook and Stefanski 1994). ``shifted`` (draws,): drawn with what the form
+    of features may shift too, which the measured width may hide.
     """
-    added = min(float(drawn.mean() - value), value)
-    # where the width is no larger than what noise adds, all of it may be noise
-    share = min(max(1 / 3, abs(added) / max(value - added, 1e-12)), 0.7)
-    sigma = float(np.sqrt(drawn.var() + share * added**2))
+    added = float(drawn.mean() - value)
+    # a width no larger than what noise adds may be noise alone, or hide as much
+    share = 0.7 if added >= value else min(max(1 / 3, abs(added) / (value - added)), 0.7)
+    hidden = max(float(np.mean(shifted**2) - np.mean(drawn**2)), 0.0)
+    sigma = float(np.sqrt(drawn.var() + share * added**2 + hidden))
     return Quantity(name, max(value - added, 0.0), "mm", sigma, whole)
 
 
@@ -446,11 +473,15 @@ def _axis_orientation(
             np.linalg.norm(np.cross(axis, direction)) if along else abs(axis @ direction)
         )
 
-    steps = draw_steps(joint_covariance(fit.spread, datum.spread), np.random.default_rng(4))
     p = f.parameters
-    drawn = np.array([off(f.moved(step[:p]), d.moved(step[p:])) for step in steps])
-    whole = fit.spread.whole and datum.spread.whole
-    return _correct_for_noise(kind, off(f, d), drawn, whole)
+
+    def draw(own: Spread, other: Spread) -> Floats:
+        """Return the orientation with each of the drawn errors (draws,)."""
+        steps = draw_steps(joint_covariance(own, other), np.random.default_rng(4))
+        return np.array([off(f.moved(step[:p]), d.moved(step[p:])) for step in steps])
+
+    drawn = draw(fit.spread.noise, datum.spread.noise), draw(fit.spread, datum.spread)
+    return _correct_for_noise(kind, off(f, d), *drawn, fit.spread.whole and datum.spread.whole)
 
 
 def _smooth_basis(
@@ -510,18 +541,21 @@ def _even_weights(unrolled: Floats) -> Floats:
 
 
 def _find_fine(points: Floats, residuals: Floats, sigma: float) -> Floats:
-    """Mean residuals (n,) mm of each point's neighbours where noise does not explain them, else 0:
-    the largest of those of `FINE_POINTS` neighbours. ``sigma``: the noise, mm."""
-    fine = np.zeros(len(points))
+    """Residuals (n,) mm where noise does not explain the mean of `FINE_POINTS` neighbours, else 0:
+    the largest such mean, or the point's own where that is larger even without noise. ``sigma``:
+    the noise, mm."""
     if not sigma > 1e-9 * float(np.abs(points).max()):
-        return fine
-    _, near = cKDTree(points).query(points, k=min(max(FINE_POINTS), len(points)))
-    sums = np.cumsum(residuals[near], axis=1)
-    for count in FINE_POINTS:
-        means = sums[:, count - 1] / count
-        is_larger = np.abs(means) > np.maximum(FINE_SIGMA * sigma / np.sqrt(count), np.abs(fine))
-        fine[is_larger] = means[is_larger]
-    return fine
+        return np.zeros(len(points))
+    counts = np.minimum(FINE_POINTS, len(points))
+    _, near = cKDTree(points).query(points, k=counts.max())
+    means = np.cumsum(residuals[near], axis=1)[:, counts - 1] / counts
+    sigmas = means * np.sqrt(counts) / sigma
+    clearest = sigmas[np.arange(len(points)), np.abs(sigmas).argmax(axis=1)]
+    sides = np.sign(clearest)
+    largest = np.maximum(
+        (sides[:, None] * means).max(axis=1), sides * residuals - NOISE_SIGMAS * sigma
+    )
+    return np.where(np.abs(clearest) > FINE_SIGMA, sides * largest, 0.0)
 
 
 def _patch_misfit(residuals: Floats, coordinates: Floats, noise: float, columns: int) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.geometry.rigid import Floats, Mask
-from slviewer.geometry.vectors import unit_vectors
+from slviewer.geometry.vectors import lengths, unit_vectors
 from slviewer.inspection.features import Feature, perpendicular_axes
 from slviewer.inspection.regions import Region
 
@@ -16,11 +16,18 @@ NEIGHBOURS = 16
 MEASURED_SHARE, HOLE_SHARE = 1 / 4, 1 / 8
 """Of these: with fewer points of the feature, its surface is not measured there, but points that
 deviate and lie parallel to it are; with the lesser share also those that do not."""
+DOUBTED_SHARE = 3 / 4
+"""With more of them, all of the feature is measured there, and what is parallel stands over it."""
 MIN_PARALLEL, SAME_COSINE = 0.5, 0.8
 """Cosine between the normal of the feature and that of a surface that may be its own; of one that
 is, where hardly anything else was measured: neighbours at an edge mix the normals of both sides."""
+MAX_SLOPE = 0.5
+"""Rise over run from what was measured near the feature, by which a parallel surface goes on from
+there, as a shallow dent does, however small."""
 LEAST_COMPANY = 3
 """Of a point's eight neighbours that deviate alike: with fewer it is isolated."""
+TOGETHER = 1 / 4
+"""Mean deviation of the eight, over the reach: about the deepest point of a dent all lie off."""
 ALIKE, LEAST_ALIKE = 0.5, 6
 """Share of a point's distance by which those of its company differ from it at most, and the least
 number of these with itself."""
@@ -36,11 +43,13 @@ SPACINGS = 3.0
 @dataclass(frozen=True, eq=False)
 class Membership:
     """Which points (n,) bool are ``isolated``, which are ``beside`` the feature, on another
-    surface, and which ``deviate``: the feature's own, though far from it. All others are near."""
+    surface, and which ``deviate``: the feature's own, though far from it. All others are near.
+    ``doubtful``: those beside it that may be its own: parallel, and over its area."""
 
     isolated: Mask
     beside: Mask
     deviates: Mask
+    doubtful: Mask
 
     @property
     def belongs(self) -> Mask:
@@ -63,14 +72,15 @@ class Membership:
 
 def find_isolated(points: Floats, residuals: Floats, reach: float) -> Mask:
     """Which points (n, 3) lie farther than ``reach`` mm off by ``residuals`` (n,), without
-    neighbours that deviate alike: (n,) bool."""
+    neighbours that deviate to the same side, some by half of that at least, or `TOGETHER` all by
+    less: (n,) bool."""
     is_far = np.abs(residuals) > reach
     isolated, count = is_far.copy(), min(9, len(points))
     if is_far.any() and count > 1:
         _, near = cKDTree(points).query(points[is_far], k=count)
-        alike = np.sign(residuals) * is_far
-        company = np.sum(alike[near[:, 1:]] == alike[is_far][:, None], axis=1)
-        isolated[is_far] = company < min(LEAST_COMPANY, count - 1)
+        along = np.sign(residuals[is_far])[:, None] * residuals[near[:, 1:]] / reach
+        company = np.sum(along > 0.5, axis=1) >= min(LEAST_COMPANY, count - 1)
+        isolated[is_far] = ~company & (np.clip(along, -1, 1).mean(axis=1) < TOGETHER)
     return isolated
 
 
@@ -91,7 +101,7 @@ def find_members(
     that is known: what a feature turns away from it has no points.
     """
     far = np.flatnonzero(~is_near)
-    masks = [np.zeros(len(points), bool) for _ in range(3)]
+    masks = [np.zeros(len(points), bool) for _ in range(4)]
     membership = Membership(*masks)
     if not len(far) or len(points) - len(far) <= NEIGHBOURS:
         return membership
@@ -113,11 +123,18 @@ def find_members(
         facing = np.sum(along * (camera - feet), axis=1)
         side = np.sign(np.median(facing[is_near]))
         own &= side * facing[far] > 0
-    own = _spread_to_company(own, feet[far], distances[far], radius)
-    membership.deviates[far] = own
+    is_open = (measured <= HOLE_SHARE) & inside[far]
+    own = _spread_to_company(own, is_open, feet[far], distances[far], radius)
+    gaps = tree.query(feet[far])[0]
+    goes_on = parallel & inside[far] & (np.abs(distances[far]) <= MAX_SLOPE * gaps)
+    own |= _select_company(goes_on, feet[far], distances[far], 2 * radius)
     company = cKDTree(points[far]).query_ball_point(points[far], 2 * radius, return_length=True)
+    membership.deviates[far] = own
     membership.isolated[far] = ~own & (company <= LEAST_COMPANY)
-    membership.beside[far] = ~own & (company > LEAST_COMPANY)
+    membership.beside[far] = beside = ~own & (company > LEAST_COMPANY)
+    may_be = beside & parallel & inside[far] & (measured <= DOUBTED_SHARE)
+    may_be[may_be] = _are_surrounded(feet[far][may_be], tree, 3 * radius)
+    membership.doubtful[far] = _select_company(may_be, feet[far], distances[far], 2 * radius)
     return membership
 
 
@@ -131,18 +148,44 @@ def _are_surrounded(feet: Floats, near: cKDTree, reach: float) -> Mask:
     return surrounded
 
 
-def _spread_to_company(own: Mask, feet: Floats, distances: Floats, radius: float) -> Mask:
+def _spread_to_company(
+    own: Mask, is_open: Mask, feet: Floats, distances: Floats, radius: float
+) -> Mask:
     """Which far points, with ``feet`` (n, 3) on the feature, are its ``own`` (n,), of those that
     have as many near ones at about their ``distances`` (n,) as a surface has; and those next to
-    them that lie between them and the feature."""
+    them that lie between them and the feature, or deeper, down a steep wall, where hardly anything
+    of the feature was measured (``is_open``)."""
     if len(feet) < LEAST_ALIKE:
         return np.zeros(len(feet), bool)
-    gaps, near = cKDTree(feet).query(feet, k=min(NEIGHBOURS, len(feet)))
-    d, around = distances[:, None], distances[near]
-    alike = (gaps <= radius) & (np.abs(around - d) <= ALIKE * np.abs(d))
+    near, alike = _find_alike(feet, distances, radius)
     own = own & (np.sum(alike, axis=1) >= LEAST_ALIKE)
-    is_between = (gaps <= radius) & (around * d > 0) & (np.abs(around) >= np.abs(d))
+    d, around = distances[:, None], distances[near]
+    is_beside = (lengths(feet[near] - feet[:, None]) <= radius) & (around * d > 0)
+    leads = is_beside & is_open[:, None] & (np.abs(around) >= ALIKE * np.abs(d))
+    while np.any(found := (leads & own[near]).any(axis=1) & ~own):
+        own |= found
+    is_between = is_beside & (np.abs(around) >= np.abs(d))
     return np.asarray(own | (is_between & own[near]).any(axis=1))
+
+
+def _select_company(chosen: Mask, feet: Floats, distances: Floats, radius: float) -> Mask:
+    """Return those of the ``chosen`` (n,) far points that have others of them within the radius at
+    about their ``distances`` (n,)."""
+    selected = chosen.copy()
+    _, alike = _find_alike(feet[chosen], distances[chosen], radius)
+    selected[chosen] = np.sum(alike, axis=1) > LEAST_COMPANY
+    return selected
+
+
+def _find_alike(feet: Floats, distances: Floats, radius: float) -> tuple[np.ndarray, Mask]:
+    """Return the nearest (n, k) of the feet (n, 3), with themselves, and which of them lie within
+    the radius at about the same of the ``distances`` (n,)."""
+    count = min(NEIGHBOURS, len(feet))
+    if not count:
+        return np.empty((0, 0), int), np.empty((0, 0), bool)
+    gaps, near = cKDTree(feet).query(feet, k=[*range(1, count + 1)])
+    off = np.abs(distances[near] - distances[:, None])
+    return near, (gaps <= radius) & (off <= ALIKE * np.abs(distances[:, None]))
 
 
 def _fill_area(feet: Floats, radius: float) -> Mask:

@@ -147,9 +147,10 @@ def fit_pose(
             points, normals, trial, reach, either_side=robust, at_edges=robust
         )
         counted, cost = np.isfinite(off), float(np.mean(_cap(off / reach)))
-        if cost >= least and not robust:  # nothing held the step
+        is_few = np.count_nonzero(counted) < MIN_COUNTED
+        if (is_few and turn) or (cost >= least and not robust):  # nothing held the step
             damping *= 100
-        elif np.count_nonzero(counted) < MIN_COUNTED:
+        elif is_few:
             raise InputError(
                 f"Only {np.count_nonzero(counted)} points of the scan lie within {reach:.3g} mm of"
                 " the nominal model: does it show that part?"
@@ -218,7 +219,8 @@ def search_pose(
             f"{NOT_ALIGNED}: at most {100 * score:.0f} % of it lies on a side of the model, in any"
             " of its poses.",
         )
-    best = _fit_start(few, few_normals, surface, best.T, sigma_mm)
+    with suppress(InputError):  # the points that it is then judged by fit better than these
+        best = _fit_start(few, few_normals, surface, best.T, sigma_mm)
     _refuse_if_doubtful(best)
     T, shape = _settle(few, few_normals, surface, best, MOST_SLACK * scan.size)
     if shape is not None:
@@ -308,7 +310,10 @@ def _list_turned(
         tried += _list_shifted(scan, model, axes, T, reach / 2)
     moved = np.concatenate([move_points(T, some) for T in tried])
     turned = None if own is None else np.concatenate([own @ T[:3, :3].T for T in tried])
-    off = surface.distances(moved, turned, np.eye(4), 2 * reach)[0].reshape(len(tried), -1)
+    off, _ = surface.distances(
+        moved, turned, np.eye(4), 2 * reach, either_side=not surface.is_solid
+    )
+    off = off.reshape(len(tried), -1)
     shares, costs = np.isfinite(off).mean(axis=1), _cap(off / reach).mean(axis=1)
     # half of them by cost: what lies near the model may lie on another of its faces
     ranked = dict.fromkeys((*np.argsort(costs)[: RIVALS // 2], *np.argsort(-shares)[:RIVALS]))

@@ -11,8 +11,8 @@ from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.surface.region_of_interest import box_edges
 
-MARGIN_MM = 1e-3
-"""Of a box around points: they lie inside, not on its faces."""
+MARGIN = 1e-5
+"""Of a box around points, over its longest side: they lie inside, not on its faces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,9 @@ class Region:
         """Return the smallest box with sides along the rows of ``axes`` (3, 3) that holds points
         (n, 3) mm."""
         along = points @ axes.T
-        return cls.box(along.min(axis=0) - MARGIN_MM, along.max(axis=0) + MARGIN_MM, axes)
+        low, high = along.min(axis=0), along.max(axis=0)
+        margin = MARGIN * float((high - low).max())
+        return cls.box(low - margin, high + margin, axes)
 
     def moved(self, T: Floats) -> "Region":
         """Return the region after a rigid motion (4, 4), in the digits of a file."""

@@ -33,16 +33,26 @@ DRAWS = 200
 class Spread:
     """Covariance of p parameters: ``scatter`` (p, p) of its own, and ``shared`` (k, p), the
     calibration's part, as ``Shared`` gives it; None where that is not known. ``calibration``: by
-    whose errors; only one calibration's are the same."""
+    whose errors; only one calibration's are the same. ``form`` (k, p): steps that are part of
+    the scatter, by which the form of what was measured may shift the parameters, and noise does
+    not."""
 
     scatter: Floats
     shared: Floats | None = None
     calibration: str = ""
+    form: Floats | None = None
 
     @property
     def covariance(self) -> Floats:
         """(p, p): total covariance."""
         return self.scatter if self.shared is None else self.scatter + self.shared.T @ self.shared
+
+    @property
+    def noise(self) -> "Spread":
+        """The spread without the form's part."""
+        if self.form is None:
+            return self
+        return replace(self, scatter=self.scatter - self.form.T @ self.form, form=None)
 
     @property
     def whole(self) -> bool:
@@ -176,7 +186,7 @@ def splined_shared(
     ``scale``: by what factor the points were enlarged after their reconstruction, and
     ``scale_sigma`` the standard uncertainty of that factor."""
     rig, raised = bundle.state.rig, bundle.noise.ratio["xy".index(axis)]
-    reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
+    reference = working_volume(rig, bundle.depth_range_mm, 7, 5, 4, bundle.area)
     motion = BestMotion.fit(reference.points)
     moved = motion.weights.T @ bundle.point_jacobian(axis, reference.pixels, reference.z).toarray()
 

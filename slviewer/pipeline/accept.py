@@ -17,7 +17,13 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from slviewer.calibration.centres import move_to_centres
-from slviewer.calibration.drift import DriftReference, DriftView, build_reference, check_drift
+from slviewer.calibration.drift import (
+    MIN_POSES,
+    DriftReference,
+    DriftView,
+    build_reference,
+    check_drift,
+)
 from slviewer.calibration.observe import Observation, observe
 from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
 from slviewer.calibration.splined.model import calibrate_splined
@@ -72,7 +78,7 @@ from slviewer.pipeline.operation import (
     part,
     stage,
 )
-from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.poses import cut_area, detect_in_area, load_observations
 from slviewer.pipeline.reconstruct import check_capture_sizes, reconstruct_captures, segment_board
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.camera_match import epipolar_lines
@@ -90,9 +96,8 @@ from slviewer.records.calibration import ModelCalibration, TransformCheck
 from slviewer.session.reading import read_toml
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.target.detect import detect
 
-REFERENCE = "drift_reference"
+REFERENCE = "drift_floor"
 Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], Model]
 FITS: dict[str, Fit] = {
     "stereo": lambda observations, stereo, progress: stereo,
@@ -289,7 +294,8 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift] | Found[Tr
     phases = match_second(shot, decoded, lambda _: epipolar_lines(load_pair(store)))
     check_sizes(capture, shot.size, shot.other_size, stereo.rig)
     board = Board.parse(stereo.board)
-    detection = detect(board, capture_texture(shot, frames))
+    image = cut_area(capture_texture(shot, frames), look.area)
+    detection = detect_in_area(board, image, look.area, several=False)
     calibrated = CalibrateSettings(**load_record(store, ModelCalibration, "stereo").settings)
     observation = observe(capture, board, detection, phases, calibrated.step_2)
     job.progress(0.3, "fitting the calibration's own poses")
@@ -314,6 +320,12 @@ def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> Drift
         if saved is not None:
             return saved
     poses = [name for name in stereo.poses if name != capture]
+    if len(poses) < MIN_POSES <= len(stereo.poses):
+        raise InputError(
+            f"{capture} is one of the calibration's own {len(stereo.poses)} poses, and the"
+            f" {len(poses)} others are too few for a drift reference",
+            "capture the board once more, and check that",
+        )
     reference = build_reference(
         stereo.rig, [DriftView.from_observation(o) for o in load_observations(store, poses)]
     )
@@ -381,7 +393,7 @@ def measure_held_out(
     clouds = {name: np.asarray(model.points(phase)) for name, model in models.items()}
     common = np.logical_and.reduce([np.isfinite(points[..., 2]) for points in clouds.values()])
     features = {
-        name: _interpolate(np.where(common[..., None], points, np.nan), observation.camera)
+        name: interpolate_points(np.where(common[..., None], points, np.nan), observation.camera)
         for name, points in clouds.items()
     }
     read = finite_rows(*features.values())
@@ -453,7 +465,7 @@ def _recommend(models: Mapping[str, HeldOutError]) -> str:
     return chosen
 
 
-def _interpolate(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def interpolate_points(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """(n, 3): an organised cloud (h, w, 3) at pixels (n, 2), linear between its own; NaN beside
     invalid ones."""
     v_u = pixels[:, ::-1].T

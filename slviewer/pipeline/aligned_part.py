@@ -23,6 +23,7 @@ from slviewer.inspection.fitting import (
 )
 from slviewer.inspection.form import (
     form_error,
+    hidden_defect,
     orientation_error,
     position_error,
     profile_error,
@@ -162,6 +163,18 @@ class AlignedPart:
         share, text = max(excluded)
         return PlanEvidence(min(known, default=None), share, text, smallest[0])
 
+    def hidden_width(self, wanted: Characteristic, smallest: float) -> float:
+        """By how much, mm, a local defect that noise may hide among few points would widen the zone
+        of a characteristic, from the `smallest_defect` that they show."""
+        name, is_double = wanted.features[0], wanted.kind in ("profile", "position")
+        if wanted.kind == "profile":
+            points = self.surface(name).points
+        else:
+            points = self.feature(name).points
+            if wanted.kind not in FORMS and self.feature(name).feature.kind != "plane":
+                return 0.0  # an axis or a centre lies where all points have it
+        return (1 + is_double) * hidden_defect(smallest, len(points))
+
     def doubts(self, names: Sequence[str]) -> list[str]:
         """Return the warnings about the scan and the fits of features."""
         fitted = [name for name in names if self.features[name].kind != "surface"]
@@ -287,11 +300,13 @@ def judge_characteristic(
         decision = "undecided"
         doubts += lacking
     is_zone = wanted.kind in (*FORMS, *TO_DATUM, "profile", "position")
-    if is_zone and decision == "pass" and evidence.smallest > (wanted.upper or np.inf):
+    hidden = value + part.hidden_width(wanted, evidence.smallest)
+    limit = wanted.upper or np.inf
+    if is_zone and decision != "fail" and max(evidence.smallest, hidden) > limit:
         decision = "undecided"
         doubts.append(
             f"a local defect of {evidence.smallest:.2g} mm would not show in the noise: scan with"
-            " less noise, such as more steps or a longer exposure"
+            " less noise, such as more steps or a longer exposure, or more densely"
         )
     whole = quantity.whole and bool(part.errors.calibration)
     return CharacteristicResult(

@@ -32,7 +32,9 @@ from slviewer.errors import (
 )
 from slviewer.examination.light import look_at
 from slviewer.fringe.decode import texture
+from slviewer.fringe.image_area import measure_picture_area
 from slviewer.fringe.layout import axis_layout
+from slviewer.fringe.raw_image import describe_mosaic
 from slviewer.fringe.sequence import PatternSequence, Size
 from slviewer.geometry.lens import Lens
 from slviewer.inputs import Input
@@ -66,19 +68,25 @@ from slviewer.pipeline.operation import (
     part,
     stage,
 )
-from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
+from slviewer.pipeline.poses import (
+    DecodedPose,
+    Judged,
+    cut_area,
+    detect_in_area,
+    read_pose,
+    read_stored_poses,
+)
 from slviewer.records.calibration import SECOND_CAMERA, ModelCalibration
 from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
 from slviewer.session.exporters import write_calibration
 from slviewer.session.importers.camera_file import read_camera_file
-from slviewer.session.importers.images import read_image
+from slviewer.session.importers.images import read_image, warn_of_alpha
 from slviewer.session.importers.imported import images_by_name
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
-from slviewer.target.board import Board
-from slviewer.target.detect import Detection, detect
+from slviewer.target.board import Board, Detection
 
 SmoothingKind = Literal["spline", "polynomial"]
 _OF_PAIR = {"projector": SECOND_CAMERA}
@@ -190,11 +198,15 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
             f"Cannot calibrate: {store.folder} is open for reading only. Close what writes to it."
         )
     before = preferred_model(store) if available_models(store) else ""
-    names, excluded = _choose_poses(store, settings, job.warn)
+
+    # which target poses, and a camera that is known
+    names, excluded = choose_poses(store, settings, job.warn)
     first = store.load_capture(names[0])
     camera = _load_camera(store, settings, first.size, job.warn)
+
+    # their frames to features, and these to a stereo calibration with its verdict
     diagnosed = _diagnose_poses(
-        read_stored_poses(store, names, board, settings.step_2),
+        _warn_of_notes(read_stored_poses(store, names, board, settings.step_2), job.warn),
         len(names),
         first.sequence,
         first.other_size or first.sequence.projector,
@@ -206,9 +218,13 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
     diagnosed = replace(diagnosed, verdict=_name_devices(diagnosed.verdict, first))
     if diagnosed.stereo is None:
         save_verdict(store, diagnosed.verdict, names)
+
+    # the models that start from it
     result = _fit_models(diagnosed, settings, part(job.progress, 0.66, 0.97), job.warn, excluded)
     result = replace(result, verdict=_name_devices(result.verdict, first))
     projector = _fit_projector(result.splined, diagnosed, first, job.warn)
+
+    # all of them take the place of the session's models in one step
     job.progress(0.97, "saving")
     inputs = store.input_hashes(*result.stereo.poses, *([LENS] if camera else []))
     used = replace(settings, camera=LENS if camera else None)  # the session's own copy
@@ -276,20 +292,23 @@ def calibrate_frames(
             "no target pose was given", "capture the board in at least three positions and tilts"
         )
 
-    judged = (
-        read_pose(
-            DecodedPose(
-                name,
-                sequence,
-                look,
-                decode_or_explain(name, sequence, look),
-                convert_to_8bit(texture(sequence, look.stack)),
-                board,
-            ),
-            settings.step_2,
-        )
-        for name, frames in poses.items()
-        for look in (look_at(sequence, frames),)
+    judged = _warn_of_notes(
+        (
+            read_pose(
+                DecodedPose(
+                    name,
+                    sequence,
+                    look,
+                    decode_or_explain(name, sequence, look),
+                    convert_to_8bit(texture(sequence, look.stack)),
+                    board,
+                ),
+                settings.step_2,
+            )
+            for name, frames in poses.items()
+            for look in (look_at(sequence, frames),)
+        ),
+        warn,
     )
     count, size = len(poses), sequence.projector
     diagnosed = _diagnose_poses(judged, count, sequence, size, board, {}, part(progress, 0, 0.65))
@@ -308,11 +327,12 @@ def save_calibration(session: SessionLike, result: CalibrationResult) -> None:
             save_model(store, model, result.verdict if model is result.stereo else None)
 
 
-def _choose_poses(
+def choose_poses(
     store: Session, settings: CalibrateSettings, warn: Warn
 ) -> tuple[list[str], dict[str, str]]:
-    """Return the target poses to calibrate from, and {pose: why} of those that are excluded. Raises
-    UsageError for a name or pattern that fits no target pose."""
+    """Return the target poses to calibrate from, and {pose: why} of those that are excluded, also
+    of those whose frames are another's. Raises UsageError for a name or pattern that fits no target
+    pose."""
     captures, faults = store.read_captures()
     for fault in faults.values():
         warn(f"not used: {fault}")
@@ -336,7 +356,15 @@ def _choose_poses(
     names = [name for name in names if name not in excluded]
     if not names:
         raise InputError("every target pose is excluded", "include some again")
-    return names, excluded
+    hashes = {capture.name: capture.hash for capture in captures}
+    first = {hashes[name]: name for name in reversed(names)}
+    copies = {
+        name: f"its frames are those of {first[hashes[name]]}, which count once"
+        for name in names
+        if first[hashes[name]] != name
+    }
+    _warn_of_excluded(copies, (), warn)
+    return [name for name in names if name not in copies], excluded | copies
 
 
 def _changes_calibration(
@@ -380,6 +408,14 @@ def _load_camera(
         )
     focal_sigma_px = float(lens.K[0, 0]) * (UNSTATED_SIGMA if sigma is None else sigma)
     return KnownCamera(lens, meta["name"], settings.fix_camera, focal_sigma_px)
+
+
+def _warn_of_notes(poses: Iterable[Judged], warn: Warn) -> Iterator[Judged]:
+    """Yield poses, and warn of what else they show."""
+    for pose in poses:
+        if pose.note:
+            warn(f"{pose.name}: {pose.note}")
+        yield pose
 
 
 def _diagnose_poses(
@@ -539,30 +575,27 @@ def calibrate_camera_alone(
         raise InputError(
             f"{source} is not a folder", "give a folder of pictures of the board, or a session"
         )
+    for warning in warn_of_alpha([each for each in there if isinstance(each, Path)]):
+        warn(warning)
     pictures = {each.name: each for each in there}
     without = match_names([*pictures], exclude, "picture")
     chosen = match_names([*pictures], poses, "picture") if poses else [*pictures]
     chosen = [name for name in chosen if name not in without]
+    if not chosen:
+        raise InputError(f"{source} holds no picture to calibrate from", "name some")
     detections, excluded = dict[str, Detection](), dict[str, str]()
-    size: Size | None = None
+    area = measure_picture_area(_read_pictures(pictures, chosen), len(chosen))
     for i, name in enumerate(chosen):
         progress(i / len(chosen), f"detecting the board in {name}")
         image = _read_picture(pictures[name])
-        height, width = image.shape[:2]
-        if size is not None and size != (width, height):
-            raise InputError(
-                f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}",
-                "use pictures of one size",
-            )
-        size = width, height
         try:
-            detections[name] = detect(board, image)
+            detections[name] = detect_in_area(board, cut_area(image, area), area)
+            for note in _list_notes(name, image, detections[name]):
+                warn(note)
         except DetectionError as error:
             excluded[name] = str(error)
             warn(f"{name} is excluded: {error}")
-    if size is None:
-        raise InputError(f"{source} holds no picture to calibrate from", "name some")
-    calibration = calibrate_camera(board, detections, size, excluded)
+    calibration = calibrate_camera(board, detections, area.size, excluded, area.describe_cut())
     if out is not None:
         entries = {
             "program": f"slviewer {__version__}",
@@ -577,6 +610,29 @@ def calibrate_camera_alone(
         write_calibration(Path(out), entries, _MEANINGS)
     progress(1.0, "calibrated")
     return calibration
+
+
+def _list_notes(name: str, image: np.ndarray, detection: Detection) -> list[str]:
+    """Return warnings about a picture in which the board was detected."""
+    mosaic = describe_mosaic(name, image[None]) if image.ndim == 2 else ""
+    return [*filter(None, (mosaic, detection.note and f"{name}: {detection.note}"))]
+
+
+def _read_pictures(
+    pictures: Mapping[str, Capture | Path], names: Sequence[str]
+) -> Iterator[np.ndarray]:
+    """Yield the named pictures; raises InputError where one differs in size."""
+    size: Size | None = None
+    for name in names:
+        image = _read_picture(pictures[name])
+        height, width = image.shape[:2]
+        if size is not None and size != (width, height):
+            raise InputError(
+                f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}",
+                "use pictures of one size",
+            )
+        size = width, height
+        yield image
 
 
 def _read_picture(source: Capture | Path) -> np.ndarray:

@@ -530,7 +530,7 @@ def capture_turn(
     rig: Rig,
     steps: Sequence[TurnStep],
     capture_step: Callable[[TurnStep, Progress], None],
-    recorded: Sequence[TurnStep] = (),
+    recorded: Sequence[TurnStep],
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> None:

@@ -16,6 +16,7 @@ from slviewer.examination.light import Look, estimate_frame_light, look_at
 from slviewer.fringe.decode import decode, texture
 from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.hdr import radiance, toned
+from slviewer.fringe.image_area import fill_dead
 from slviewer.fringe.layout import axis_layout, to_eight_bits, white_level
 from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
 from slviewer.fringe.phase_shifting import dark_limit, dark_sigmas
@@ -120,7 +121,8 @@ def match_second(
         warn(f"{second.name}: {message}")
     known = None
     if lines is not None and len(phases) == 1:
-        known = lines(capture_texture(second, look.stack))
+        image = capture_texture(second, look.stack)
+        known = lines(fill_dead(image, look.area))
     return match_cameras(phases, decode_capture(second, look), known)
 
 
@@ -278,10 +280,8 @@ def scatter_warnings(phases: PhaseMaps) -> list[str]:
     if worst is None or worst.sigma_scale <= SIGNIFICANT:
         return []
     if measure_scatter(worst).is_compressed:
-        cause, cure = (
-            "the images were compressed (JPEG blocks of 8 x 8 pixels)",
-            "record PNG, TIFF or raw images",
-        )
+        cause = "the images were compressed (JPEG blocks of 8 x 8 pixels)"
+        cure = "record PNG, TIFF or raw images"
     else:
         cause, cure = "sharpening or compression may be the cause", "switch them off in the camera"
     return [
@@ -317,7 +317,7 @@ def convert_to_8bit(image: np.ndarray) -> np.ndarray:
 def decode_captures(
     session: Session,
     names: Sequence[str],
-    warn: Warn = ignore_warnings,
+    warn: Warn,
     *,
     relative: bool = False,
     check: bool = True,

@@ -357,7 +357,9 @@ class _Repetition:
             # the session is read alone: its files stay as they are
             with self._note_failure(*records), Session.open(self.fresh.folder) as reading:
                 made_from = (
-                    each for each in record.inputs if each.partition("/")[0] in all_kinds()
+                    each
+                    for each, used in record.inputs.items()
+                    if used and each.partition("/")[0] in all_kinds()
                 )
                 if missing := [each for each in made_from if not reading.has_result(each)]:
                     raise InputError(

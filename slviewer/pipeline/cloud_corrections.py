@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
+from slviewer.geometry.vectors import finite_rows
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import AcceptanceTest
 from slviewer.records.record import from_plain
@@ -146,7 +147,7 @@ def restrict_cloud(store: Session, scan: str, cloud: C, region: RegionOfInterest
     if region is None and not history.active:
         return cloud
     kept = history.keep_mask(points)
-    measured = int(np.count_nonzero(np.isfinite(points).all(axis=-1)))
+    measured = int(np.count_nonzero(finite_rows(points)))
     if measured and not kept.any():
         raise InputError(
             f"{scan}: all of its {measured} points were deleted by {history.applied} edits",

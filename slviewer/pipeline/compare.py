@@ -38,8 +38,9 @@ from slviewer.records.measurement import (
     ToleranceVerdict,
 )
 from slviewer.records.record import to_matrix, to_vector
-from slviewer.session.nominal import NOMINALS, Nominal, Units, check_size, read_nominal
+from slviewer.session.nominal import NOMINALS, Nominal, check_size, read_nominal
 from slviewer.session.ply import write_ply
+from slviewer.session.units import Units
 
 MAX_STORED_POINTS = 120_000
 """Points that a session keeps of a deviation, for pictures of it; the figures are of all."""
@@ -247,7 +248,7 @@ def _write_points(
         on.points[on.measured][counted],
         colours=deviation_colours(signed, limit),
         normals=None if on.normals is None else on.normals[on.measured][counted],
-        scalars={"deviation": signed},
+        scalars={"deviation": signed.astype(np.float32)},
         faces=faces,
         notes=[
             f"{on.source} against {nominal.name}",

@@ -1,27 +1,34 @@
 """Detecting a board in photographs: where its features are, or why it cannot be measured."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slviewer.errors import InputError
+from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.fringe.layout import to_eight_bits
+from slviewer.geometry.vectors import rms_length
+from slviewer.pipeline.capture_phases import capture_texture
 from slviewer.printable import format_csv
 from slviewer.records.record import to_plain
 from slviewer.session.atomic import replace_file
 from slviewer.session.importers.images import read_image
-from slviewer.target.board import Board
-from slviewer.target.detect import Detection, detect
+from slviewer.session.store import Session
+from slviewer.target.board import Board, Detection
+from slviewer.target.detect import RecognisedBoard, detect, recognise_board
 from slviewer.target.planar import GridMap, fit_grid_map
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
 COLUMNS = ("image", "index", "x_mm", "y_mm", "u_px", "v_px")
 _BLUE, _RED, _GREEN, _BLACK = (255, 120, 0), (40, 40, 255), (40, 200, 40), (0, 0, 0)  # BGR
+T = TypeVar("T")
+MOST_EXAMINED = 5
+"""Pictures, about, in which a board is recognised: each takes a second or so."""
 _LARGEST_OVERLAY_PX = 1600
 
 
@@ -31,7 +38,7 @@ class BoardImageResult:
     the board's mark on where that was seen (``marked``), or why it was not detected (``refusal``).
 
     ``rms_px`` (None without the board): how far the features lie from the smooth map of a flat grid
-    behind a lens.
+    behind a lens. ``note``: what else is in view and not used.
     """
 
     image: Path
@@ -41,6 +48,7 @@ class BoardImageResult:
     rms_px: float | None = None
     index: Sequence[int] = ()
     pixels: Sequence[Sequence[float]] = ()
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +101,7 @@ class BoardsDetected:
 
 def detect_board(
     images: Sequence[Path | str],
-    target: str,
+    target: str = "",
     *,
     out: Path | str | None = None,
     csv_out: Path | str | None = None,
@@ -106,7 +114,8 @@ def detect_board(
     Args:
         images: Image files, or folders of them.
         target: circles:21x16:9 (columns x rows : pitch mm), acircles:..., chessboard:9x7:75 (inner
-            corners : square mm), charuco:....
+            corners : square mm), charuco:.... Without it, the chessboard or grid of circles that
+            the images show is named.
         out: The picture with numbered features and the board's axes; a folder where there are
             several images.
         csv_out: Table of all features: image, index, place on the board in mm, place in the image
@@ -115,8 +124,10 @@ def detect_board(
     A photograph that cannot be read, or in which the board is not detected, is a result with its
     reason. Raises InputError where there is no photograph at all.
     """
-    board = Board.parse(target)
     paths = _list_photographs([Path(image) for image in images])
+    if not target:
+        raise _request_target(paths)
+    board = Board.parse(target)
     results = []
     for path in paths:
         picture, detection = None, None
@@ -124,9 +135,9 @@ def detect_board(
             picture = read_image(path)
             detection = detect(board, picture[..., ::-1] if picture.ndim == 3 else picture)
             ids, pixels = detection.ids.tolist(), detection.pixels.tolist()
-            residuals = _fit_grid(board, detection, detection.pixels).residuals
-            rms_px = float(np.sqrt((residuals**2).sum(1).mean()))
-            found = BoardImageResult(path, True, "", detection.marked, rms_px, ids, pixels)
+            rms_px = rms_length(_fit_grid(board, detection, detection.pixels).residuals)
+            marked, note = detection.marked, detection.note
+            found = BoardImageResult(path, True, "", marked, rms_px, ids, pixels, note)
         except InputError as error:
             found = BoardImageResult(path, refusal=str(error))
         results.append(found)
@@ -146,6 +157,45 @@ def detect_board(
         rows = [(*row, f"{u:.4f}", f"{v:.4f}") for *row, u, v in detected.rows()]
         replace_file(Path(csv_out), format_csv([COLUMNS, *rows]).encode())
     return detected
+
+
+def _request_target(paths: Sequence[Path]) -> UsageError:
+    """Return the error of a missing target, with the board that the photographs show."""
+
+    def read() -> Iterator[np.ndarray]:
+        """Yield those that can be read, in RGB."""
+        for path in _select_some(paths):
+            with suppress(InputError):
+                picture = read_image(path)
+                yield picture[..., ::-1] if picture.ndim == 3 else picture
+
+    recognised = recognise_board(read())
+    if recognised is None:
+        return UsageError(
+            "no target was given, and none was recognised",
+            "give --target with kind, columns x rows : pitch in mm, such as circles:21x16:9",
+        )
+    notation = recognised.notation
+    return UsageError(recognised.text(), f"give its pitch in mm: --target {notation}:PITCH")
+
+
+def _select_some(items: Sequence[T]) -> Sequence[T]:
+    """Return about `MOST_EXAMINED` of many items, evenly."""
+    return items[:: max(1, len(items) // MOST_EXAMINED)]
+
+
+def recognise_target(store: Session) -> RecognisedBoard | None:
+    """Return the board that some of the session's target poses show; None where none is
+    recognised."""
+    captures = store.captures("calibration", with_frames=True)
+
+    def read() -> Iterator[np.ndarray]:
+        """Yield the pictures of those that can be read."""
+        for each in _select_some(captures):
+            with suppress(SlviewerError):
+                yield capture_texture(each, each.frames)
+
+    return recognise_board(read())
 
 
 def _fit_grid(board: Board, detection: Detection, pixels: np.ndarray) -> GridMap:
@@ -217,4 +267,5 @@ def _describe_result(board: Board, found: BoardImageResult) -> str:
     return (
         f"{found.image.name}: {len(found.index)} of {len(board.points)} {features} detected,"
         f" {found.rms_px:.3f} px RMS from a flat grid{mark}"
+        + (f"; {found.note}" if found.note else "")
     )

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
+from slviewer.geometry.vectors import finite_rows
 from slviewer.pipeline.cloud_corrections import OFF, parse_region
 from slviewer.pipeline.models import ModelName, check_accepted
 from slviewer.pipeline.operation import (
@@ -181,7 +182,7 @@ def delete_points(store: Session, selections: Sequence[Selection], what: str) ->
     made = datetime.now(UTC).isoformat(timespec="milliseconds")
     edits = dict[str, Edit]()
     for each in selections:
-        measured = np.isfinite(each.points).all(axis=-1)
+        measured = finite_rows(each.points)
         if not (each.selected & measured).any():
             continue
         edit = make_edit(each.points, each.selected, what, each.plane, made)
@@ -199,7 +200,7 @@ def delete_points(store: Session, selections: Sequence[Selection], what: str) ->
     return edits
 
 
-def step_history(store: Session, scans: Sequence[str], *, redo: bool = False) -> dict[str, str]:
+def step_history(store: Session, scans: Sequence[str], *, redo: bool) -> dict[str, str]:
     """Undo the last edit among those of several scans, of all scans that it was made of; or bring
     back (``redo``) what was undone last. Returns {scan: when it was made}. InputError where there
     is none."""
@@ -216,7 +217,7 @@ def step_history(store: Session, scans: Sequence[str], *, redo: bool = False) ->
     return stepped
 
 
-def step_edits(store: Session, made: Mapping[str, str], *, redo: bool = False) -> None:
+def step_edits(store: Session, made: Mapping[str, str], *, redo: bool) -> None:
     """Undo the last edit of each scan, or bring back (``redo``) the one that was undone last, in
     one step. InputError where that is not the one that was made at the time {scan: time}."""
     with store.together():

@@ -145,8 +145,7 @@ def check_capture_exposure(
     if not illuminated.any():
         return Check("exposure", "bad", "No pixel sees the patterns.", _BRIGHTER)
     rows = select_rows(*frames.shape[1:])
-    coded = [i for i, frame in enumerate(sequence.frames) if frame.kind != "texture"]
-    brightest = np.max([frames[i][rows] for i in coded], axis=0)
+    brightest = np.max([frames[i][rows] for i in sequence.patterns], axis=0)
     levels = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()
     share = float(np.quantile(levels, 0.995)) / full
     clipped = max(phase.share(Reason.SATURATED) for phase in phases.values())
@@ -183,7 +182,7 @@ def warn_of_exposure(
         warn(f"{name}: {exposure.message}")
 
 
-VERSION = 10
+VERSION = 12
 """Of the examination; results of another version are computed anew."""
 _NUMBERED = re.compile(
     r"\b((?:frame|image)s? )(\d+(?:(?:, | and )\d+)*)\b(?! is missing)", re.IGNORECASE

@@ -1,7 +1,7 @@
 """Files for other programs, of everything that a session holds. The wizard's step Export and the
 command call this."""
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -11,7 +11,7 @@ from slviewer import __version__
 from slviewer.calibration.pinhole_fit import fit_splined, pixelwise_residuals
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.errors import InputError
+from slviewer.errors import InputError, UsageError
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import rigid_transform
 from slviewer.pipeline.cloud_corrections import (
@@ -20,6 +20,7 @@ from slviewer.pipeline.cloud_corrections import (
     restriction_notes,
     scale_factor,
 )
+from slviewer.pipeline.machine_poses import load_places
 from slviewer.pipeline.models import (
     ModelName,
     available_models,
@@ -39,7 +40,13 @@ from slviewer.pipeline.operation import (
     part,
     takes_settings,
 )
-from slviewer.pipeline.reconstruct import merge_name, points_with_normals, read_merge, scan_cloud
+from slviewer.pipeline.reconstruct import (
+    load_origin,
+    merge_name,
+    points_with_normals,
+    read_merge,
+    scan_cloud,
+)
 from slviewer.pipeline.report import report
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
@@ -53,14 +60,15 @@ from slviewer.session.names import natural_key
 from slviewer.session.reading import expand_user
 from slviewer.session.shape_files import (
     all_formats,
+    describe_loss,
     estimated_bytes,
     mesh_formats,
     point_formats,
     write_shape,
 )
 from slviewer.session.store import Session
-from slviewer.surface.meshing import MeshingPlan, build_mesh
-from slviewer.surface.shapes import PointSet
+from slviewer.surface.meshing import TRIANGLES_PER_POINT, MeshingPlan, build_mesh
+from slviewer.surface.shapes import PointSet, move_shape
 
 _FRAMES = (
     "T_a_b maps points of frame b into frame a: X_a = T_a_b X_b, in mm. Camera and projector look"
@@ -177,7 +185,7 @@ def write_calibration_file(store: Session, path: Path, model: str) -> str:
         "T": factor * rig.t,
         "T_projector_camera": T,
         "T_camera_projector": np.linalg.inv(T),
-        "baseline_mm": factor * float(np.linalg.norm(rig.t)),
+        "baseline_mm": factor * rig.baseline_mm,
         "scale_factor": None if factor == 1 else factor,
         "depth_range_mm": factor * np.array(depths) if depths else None,
         "target_poses": count or None,
@@ -389,17 +397,17 @@ def describe_format(file_format: str) -> str:
 
 
 def estimate_file_bytes(
-    what: What, file_format: str, points: int, model: str = "", triangles: int | None = None
-) -> int | None:
-    """About how large a file of a scan or a merge of so many points becomes, thinned to
-    ``triangles`` where that is wanted; None where it is not known before."""
+    what: What, file_format: str, points: int, model: str, triangles: int | None
+) -> int:
+    """About how large a file of a scan or a merge of so many points becomes at most, thinned to
+    ``triangles`` where that is wanted."""
     if what in ("cloud", "merge"):
         return estimated_bytes(file_format, points, scalars=3 if model == "splined" else 1)
-    # between neighbouring pixels, all but those at borders
-    faces = 2 * points if what == "mesh" else None
+    faces = TRIANGLES_PER_POINT * points
     if triangles is not None:
-        faces = triangles if faces is None else min(triangles, faces)
-    return None if faces is None else estimated_bytes(file_format, faces // 2, faces, scalars=1)
+        # a surface fitted to the points may have more
+        faces = min(triangles, faces) if what == "mesh" else triangles
+    return estimated_bytes(file_format, faces // 2, faces, scalars=1)
 
 
 def check_export(what: What, file_format: str) -> None:
@@ -432,8 +440,8 @@ class ExportSettings(Callbacks):
             merged-mesh; calibration for OpenCV or as JSON; coefficients of each pixel as .npz;
             poses of camera, projector, target and scans as 4x4 matrices; report as HTML; table of
             the figures of verifications, clouds and merges as CSV.
-        name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model
-            of coefficients.
+        name: The scan of a cloud or a mesh, or a merge, as merge/1; the number of a merge, by
+            default the last; the model of coefficients.
         out: The file, whose suffix selects the format, or a folder; by default the session's
             exports.
         file_format: ply, stl, obj, glb, 3mf, xyz, pcd, e57, yml, xml, json, ..., where --out is a
@@ -444,6 +452,8 @@ class ExportSettings(Callbacks):
         roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the
             camera's frame (x right, y down, z away), a TOML file, or off; by default the session's.
             A merge was cut when it was made.
+        frame: Of clouds and meshes: camera, or robot, the base of the machine whose poses `import
+            poses` stored, by the hand-eye calibration.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     The file is written whole or not at all.
@@ -458,6 +468,7 @@ class ExportSettings(Callbacks):
     model: ModelName | None = None
     plan: MeshingPlan | None = None
     roi: str = ""
+    frame: Literal["camera", "robot"] = "camera"
     accept_rejected: bool = False
 
 
@@ -466,6 +477,11 @@ def export(settings: ExportSettings) -> Exported:
     """Write a file for other programs: points and meshes in mm, or in the unit that the format
     demands, calibration, poses."""
     what = settings.what
+    if what in _SCANS and settings.name.startswith(f"{Merge.kind}/"):
+        what = "merge" if what == "cloud" else "merged-mesh"
+        settings = replace(settings, what=what)
+    if settings.frame == "robot" and what not in (*_SCANS, *_MERGES):
+        raise UsageError(f"{what} has no frame of its own", "omit --frame")
     with opened(settings.session) as store:
         chosen = settings.file_format.lower().removeprefix(".")
         file_format = chosen or formats(what)[0]
@@ -500,16 +516,25 @@ def _write_shape(store: Session, name: str, target: Path, settings: ExportSettin
                 f"{name}: no pixel was measured",
                 "does the calibration belong to this camera and projector?",
             )
-        whose, model = name, cloud.model
+        whose, model, placed = name, cloud.model, name
         origin = f"scan {name}, frame: {frame_of(store, model)}, x right, y down, z away"
         restrictions = restriction_notes(store, [name], resolve_region(store, settings.roi))
     else:
         whose = f"merge {name}"
         progress(0.08, "reading the merged points")
         merge, merged = read_merge(store, f"merge/{name}", settings.warn, settings.roi)
-        model, restrictions = merge.model, tuple(merge.restrictions)
+        model, restrictions, placed = merge.model, tuple(merge.restrictions), merge.reference
         frame = f"{frame_of(store, model)}, at {merge.reference}"
         origin = f"{whose} of {', '.join(merge.scans)}, frame: {frame}"
+    origin_mm, T_frame_camera = load_origin(store, placed), None
+    if settings.frame == "robot":
+        if origin_mm is not None:
+            raise InputError(
+                f"{placed} was imported with far coordinates of its own, which no machine placed",
+                "export it without --frame robot",
+            )
+        T_frame_camera = load_places(store, [placed], model)[placed].T
+        origin = f"{whose}, frame: base of the machine that placed {placed}"
     calibration = model and f"calibration {model}", describe_scale(store, model)
     notes = [origin, *filter(None, calibration), *restrictions]
     if settings.what in _MESHES:
@@ -517,8 +542,13 @@ def _write_shape(store: Session, name: str, target: Path, settings: ExportSettin
         built = build_mesh(source, settings.plan or MeshingPlan(), part(progress, 0.4, 0.8))
         made = built.text().splitlines()
         progress(0.85, f"writing {target.name}")
-        write_shape(target, built.mesh, notes=[*notes, _ALONG_NORMAL, *made])
-        return f"{whose}: {'; '.join(made)}"
+        mesh = replace(built.mesh, origin=origin_mm)
+        if T_frame_camera is not None:
+            mesh = move_shape(T_frame_camera, mesh)
+        write_shape(target, mesh, notes=[*notes, _ALONG_NORMAL, *made])
+        return "; ".join(
+            [f"{whose}: {'; '.join(made)}", *filter(None, [describe_loss(target, mesh)])]
+        )
     if is_scan:
         progress(0.56, "normals")
         normals, rgb = cloud_normals(cloud)[mask], cloud.rgb
@@ -527,9 +557,13 @@ def _write_shape(store: Session, name: str, target: Path, settings: ExportSettin
     else:
         points = PointSet(merged.points, merged.normals, merged.colours)
         scalars, sigma = merged.scalars, _ALONG_NORMAL
+    points = replace(points, origin=origin_mm)
     progress(0.85, f"writing {target.name}")
+    if T_frame_camera is not None:
+        points = move_shape(T_frame_camera, points)
     write_shape(target, points, scalars=scalars, notes=[*notes, sigma])
-    return f"{whose}: {len(points)} points"
+    loss = describe_loss(target, points, cloud.scalars if is_scan else ())
+    return "; ".join([f"{whose}: {len(points)} points", *filter(None, [loss])])
 
 
 def _write_document(store: Session, name: str, target: Path, settings: ExportSettings) -> str:

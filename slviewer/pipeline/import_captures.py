@@ -22,6 +22,12 @@ from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.phase import Reason
+from slviewer.fringe.raw_image import describe_mosaic
+from slviewer.fringe.rounded_periods import (
+    RoundedPeriods,
+    find_rounded_periods,
+    replace_periods,
+)
 from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, Size, parse_size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
@@ -41,7 +47,7 @@ from slviewer.pipeline.operation import (
 )
 from slviewer.session.capture import NewCapture, Role
 from slviewer.session.importers import matlab_calibration, opencv_calibration
-from slviewer.session.importers.filestorage import read_storage
+from slviewer.session.importers.filestorage import Storage, read_storage
 from slviewer.session.importers.guessed_frames import guess_description
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
@@ -61,12 +67,14 @@ from slviewer.session.importers.layouts import (
     layouts,
 )
 from slviewer.session.layout import is_session
-from slviewer.session.nominal import MM, Units
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
+from slviewer.session.units import MM, Units
 
 GivenSize = str | Size
 Keys = tuple[str, str, str, str, str, str]
+QUARTER_TURNS = 0.02
+"""Of a period: an origin so near to quarters of it is an offset of the fringes."""
 MAX_OUTSIDE = 0.01
 """Part of the pixels whose codes may lie outside of the projector: misread ones."""
 
@@ -369,6 +377,11 @@ def _list_assumptions(recording: ImportableRecording, capture: NewCapture) -> It
             f"the frames are in colour: their {used} channel was used (--channel, or channel in the"
             f" TOML: {others})"
         )
+    if recording.sequence.binary and not capture.sequence.binary:
+        yield (
+            "the images of plain binary numbers are stored as Gray code, by which the phase steps"
+            " are counted: pixels at the edges of its cells that stay unclear are masked"
+        )
     if capture.sequence.projector_size is None:
         yield (
             "the size of the projector is not stated: the captures can be decoded, and to calibrate"
@@ -410,13 +423,43 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
                     f"{capture.name}: the codes along {axis} fit the projector if they are centred"
                     f" on it: gray_origin is taken for {sequence.origin_px(axis):g} px"
                 )
+    if mosaic := describe_mosaic(capture.name, frames):
+        warn(mosaic)
     phases = decode_examined(capture.name, sequence, frames, capture.files)
     warn_of_exposure(capture.name, sequence, frames, phases, warn)
+    for axis, decoded in phases.items():
+        if rounded := find_rounded_periods(sequence, frames, decoded):
+            sequence = _take_periods(capture.name, sequence, axis, rounded, warn)
     return replace(capture, sequence=sequence)
 
 
+def _take_periods(
+    name: str, sequence: PatternSequence, axis: Axis, rounded: RoundedPeriods, warn: Warn
+) -> PatternSequence:
+    """Return the sequence with the periods that its own are rounded from, if they are, and warn of
+    these and of those that may be."""
+    if rounded.is_contradicted:
+        return sequence
+    extent = sequence.extent(axis)
+    off_px = extent * max(abs(exact / each - 1) for each, exact in rounded.exact.items())
+    described = [f"{each:g}" for each in rounded.exact]
+    stated = [f'"{extent}/{count}"' for count in rounded.fringes]
+    remedy = " and ".join(f"{a} as {b}" for a, b in zip(described, stated, strict=True))
+    counts = " and ".join(map(str, rounded.fringes))
+    is_taken = rounded.is_taken
+    warn(
+        f"{name}: {' and '.join(described)} px along {axis} {'are' if is_taken else 'may be'}"
+        f" rounded from {counts} fringes across {extent} px,"
+        f" {'which are taken' if is_taken else 'which the frames do not show'}: rounded periods put"
+        f" coordinates up to {off_px:.2g} px off. State {remedy} in period_px"
+    )
+    return replace_periods(sequence, axis, rounded.exact) if is_taken else sequence
+
+
 def _estimate_origins(capture: NewCapture, warn: Warn) -> PatternSequence:
-    """Return the sequence with the Gray origin of each axis that has fringes too."""
+    """Return the sequence with the Gray origin of each axis that has fringes too; or, where that is
+    quarters of a period, as a sine or another sign makes them, with a phase offset: code 0 begins
+    at the projector's first column, unless stated."""
     sequence, frames = capture.sequence, capture.frames
     axes = [
         each for each in sequence.axes if sequence.periods_px(each) and sequence.find("gray", each)
@@ -433,11 +476,26 @@ def _estimate_origins(capture: NewCapture, warn: Warn) -> PatternSequence:
         raise
     if not origins:
         return sequence
+    offsets = {"x": sequence.offset_rad("x"), "y": sequence.offset_rad("y")}
+    for axis, origin in origins.items():
+        # the first column begins half a pixel before its middle, which some count as 0
+        period, edge = sequence.periods_px(axis)[-1], 0.25
+        quarters = round(4 * (origin + edge) / period)
+        rest = origin - quarters / 4 * period
+        if quarters % 4 and abs(rest + edge) < edge + QUARTER_TURNS * period:
+            offsets[axis] = (offsets[axis] + np.pi / 2 * quarters) % (2 * np.pi)
+            origins[axis] = rest
+            warn(
+                f"{capture.name}: by the Gray code, the fringes along {axis} begin"
+                f" {-quarters / 4 % 1:g} periods late: phase_offset = {offsets[axis]:.3f} (rad) is"
+                f" taken; if the code begins elsewhere instead, state gray_origin = {origin:.2f}"
+                " (px)"
+            )
     listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
     warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
     first = next(iter(origins.values()))
     origin_px = PerAxis(origins.get("x", first), origins.get("y", first))
-    return replace(sequence, gray_origin_px=origin_px)
+    return replace(sequence, gray_origin_px=origin_px, phase_offset_rad=PerAxis(**offsets))
 
 
 def import_opencv_calibration(
@@ -479,6 +537,7 @@ def import_opencv_calibration(
     unit = unit or matlab_calibration.read_unit(storage)
     matrices = opencv_calibration.read_matrices(storage, keys, MM[unit or "mm"])
     stated = opencv_calibration.read_sizes(storage)
+    _warn_of_unused(storage, keys, stated, warn)
     with opened_or_made(session) as store:
         there = available_models(store)
         if there and not force:
@@ -512,6 +571,16 @@ def import_opencv_calibration(
         if warning := warning_of_imported(store):
             warn(warning)
         return model
+
+
+def _warn_of_unused(
+    storage: Storage, keys: Keys | None, sizes: dict[str, tuple[Size, str]], warn: Warn
+) -> None:
+    """Warn of the entries of a calibration that an import does not use, by their names; ``sizes``:
+    those that it states."""
+    keys_used = keys or opencv_calibration.identify_keys(storage)
+    if unused := opencv_calibration.list_unused(storage, keys_used, sizes):
+        warn(f"{storage.name}: not used: {', '.join(unused)}")
 
 
 def identify_calibration_keys(file: Path | str) -> dict[str, str]:

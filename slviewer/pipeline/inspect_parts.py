@@ -250,6 +250,16 @@ def match_parts(store: Session, patterns: Sequence[str]) -> list[str]:
     return [*names, *merges]
 
 
+def read_session_plan(store: Session, path: Path | str) -> Plan:
+    """Read a plan, whose nominal model is the session's own file of that name, where it has one."""
+    plan = read_plan(path)
+    if plan.alignment.nominal is not None:
+        own = store.folder / NOMINALS / Path(plan.alignment.nominal).name
+        if own.is_file():
+            plan = replace(plan, alignment=replace(plan.alignment, nominal=str(own)))
+    return plan
+
+
 @operation("run-plan", Inspection, RunPlanSettings)
 def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]:
     """Inspect scans of a session, each a part, by a plan; its exports then hold parts.html,
@@ -259,11 +269,7 @@ def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]
     stops no other.
     """
     store = job.store
-    plan = read_plan(settings.plan)
-    if plan.alignment.nominal is not None:
-        own = store.folder / NOMINALS / Path(plan.alignment.nominal).name
-        if own.is_file():
-            plan = replace(plan, alignment=replace(plan.alignment, nominal=str(own)))
+    plan = read_session_plan(store, settings.plan)
     sources = [
         (name, partial(_load_part, store, name, settings, job.warn))
         for name in match_parts(store, settings.scans)

@@ -13,6 +13,7 @@ import numpy as np
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError, UsageError
 from slviewer.geometry.rigid import move_points
+from slviewer.geometry.vectors import finite_rows
 from slviewer.inputs import Input
 from slviewer.inspection.features import KINDS, Feature, distance, relation
 from slviewer.inspection.fitting import NO_ERRORS, fit_feature
@@ -101,7 +102,7 @@ class MeasuredSurface:
     @property
     def measured(self) -> np.ndarray:
         """Mask of the measured points, (h, w) or (n,) bool."""
-        return np.asarray(np.isfinite(self.points).all(axis=-1))
+        return finite_rows(self.points)
 
     def within(self, region: Region) -> np.ndarray:
         """(n, 3) float64: the points of a region."""

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
-from slviewer.geometry.rigid import Floats32, move_points, rotation_angle
+from slviewer.geometry.rigid import Floats32, Uncertainty, move_points, rotation_angle
 from slviewer.pipeline.cloud_corrections import (
     describe_calibration,
     resolve_region,
@@ -27,11 +27,13 @@ from slviewer.pipeline.cloud_corrections import (
 )
 from slviewer.pipeline.cloud_record import list_outside_depths
 from slviewer.pipeline.imported_calibration import check_calibration
+from slviewer.pipeline.machine_poses import load_places, place_inputs
 from slviewer.pipeline.models import (
     ModelName,
     check_accepted,
     frame_of,
     load_model,
+    preferred_model,
 )
 from slviewer.pipeline.operation import (
     Found,
@@ -51,12 +53,14 @@ from slviewer.records.merge import (
     ContradictingPair,
     MarkerPair,
     Merge,
+    PlacedByMachine,
     Placement,
     RefusedPair,
     Registered,
     rests_on_start,
 )
 from slviewer.records.record import to_matrix, to_vector
+from slviewer.registration.machine_places import MachinePlace, at_point, compare_place
 from slviewer.registration.markers import (
     MeasuredMarkers,
     fit_marker_pose,
@@ -86,7 +90,7 @@ _PIXELS = 130_000
 """Of a scan that is aligned: rows and columns of larger ones are skipped."""
 _SHOWN_POINTS = 25_000  # of a scan
 _REACH = 2.5  # spacings of the shown points
-StartKind = Literal["features", "turntable", "identity", "placed", "markers"]
+StartKind = Literal["features", "turntable", "identity", "placed", "markers", "machine"]
 Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 """Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
 
@@ -123,7 +127,10 @@ class MergeSettings:
             the turntable, and the markers of a mat on it where the scans show them; identity
             assumes that the scans are nearly aligned already; placed takes the places that `align`
             found; markers takes coded markers (`slviewer target markers:0-23:20`) that the scans
-            show, which also hold what the shape leaves open.
+            show, which also hold what the shape leaves open; machine takes the poses of a robot, a
+            CMM or a stage (`slviewer import poses`).
+        fixed: Keep the scans where the machine has them, with --start machine; by default the
+            surfaces refine their places. Either way their disagreement is reported.
         angle: Degrees that the turntable turns from each capture to the next, with --start
             turntable; by default as stored with the captures of `slviewer turn`.
         model: Which calibration to use; by default the best one available.
@@ -144,6 +151,7 @@ class MergeSettings:
     model: ModelName | None = None
     start: StartKind = "features"
     angle: float | None = None
+    fixed: bool = False
     roi: str = ""
     accept_rejected: bool = False
     picked: Picked | None = None
@@ -160,6 +168,10 @@ class MergeSettings:
             raise UsageError(
                 "an angle from scan to scan is that of a turntable",
                 "give --start turntable too, or neither",
+            )
+        if self.fixed and self.start != "machine":
+            raise UsageError(
+                "fixed places are those of a machine", "give --start machine too, or neither"
             )
         self.fit_picks()
 
@@ -199,8 +211,13 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     job, store, names, warn = job.accepting(settings), job.store, settings.names, job.warn
     if settings.out is not None:
         Path(settings.out).parent.mkdir(parents=True, exist_ok=True)  # or it fails now
+
+    # captures to clouds, and what their places are estimated from
     table_deg = _list_table_angles(store, settings)
     starts = _initial_alignments(job, settings, table_deg)
+    places = _load_places(store, settings)
+    if places:
+        starts = replace(starts, poses={name: each.T for name, each in places.items()})
     check_calibration(job)
     restrictions = restriction_notes(store, names, resolve_region(store, settings.roi))
     inputs = restriction_inputs(store, names, with_region=not settings.roi)
@@ -211,23 +228,91 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
             _check_markers(markers, warn)
         if table_deg is None or _is_mat(markers, table_deg, warn):
             starts = replace(starts, markers=markers)
-    registered = register_object(
-        clouds, settings.reference, starts, stage(job.progress, 0.4, 0.75, "registering")
-    )
+
+    # clouds to places, without what did not move with the object
+    registered, machine = _register(job, settings, clouds, starts, places)
     alignment = registered.alignment
     for why in _list_warnings(clouds, registered):
         warn(why)
+    for each in machine:
+        if not each.agrees or each.why:
+            warn(each.text())
     clouds = dict(registered.clouds)
+
+    # placed clouds to one surface
     progress = stage(job.progress, 0.75, 0.9, "fusing")
     fused = fuse(clouds, alignment.T_reference_scan, progress, alignment.uncertainties)
+
+    # the surface to the file, which appears once the caller has stored the record
     job.progress(0.9, "writing")
     used = describe_calibration(store, model, fused.names)
     used["inputs"] |= inputs
     used["depths"] = list_outside_depths(store, clouds, warn)
-    record = _make_record(registered, fused, restrictions=list(restrictions), **used)
+    used |= {"restrictions": list(restrictions), "machine": machine}
+    used["inputs"] |= place_inputs(store, list(places))
+    record = _make_record(registered, fused, **used)
     with _write_merge(store, settings, fused, record) as found:
         yield MergedScans(alignment, fused, clouds, found)
     job.progress(1.0, "merged")
+
+
+def _load_places(store: Session, settings: MergeSettings) -> dict[str, MachinePlace]:
+    """Return the places of the scans by the machine; empty where the merge does not start from
+    them."""
+    if settings.start != "machine":
+        return {}
+    imported = all(store.load_capture(name).is_imported_cloud for name in settings.names)
+    model = "" if imported else settings.model or preferred_model(store)
+    return load_places(store, settings.names, model)
+
+
+def _register(
+    job: Job,
+    settings: MergeSettings,
+    clouds: Mapping[str, Cloud],
+    starts: Starts,
+    places: Mapping[str, MachinePlace],
+) -> tuple[ObjectAlignment, list[PlacedByMachine]]:
+    """Register the scans, and compare the result with the places that a machine has them in, which
+    are kept where they are fixed."""
+    reference = settings.reference
+    given = {name: places[reference].relative(place) for name, place in places.items()}
+    middles = {
+        name: T[:3, :3] @ clouds[name].measured.mean(0) + T[:3, 3] for name, (T, _) in given.items()
+    }
+    fixed = {
+        name: Uncertainty(at_point(covariance, middles[name]), middles[name])
+        for name, (_, covariance) in given.items()
+    }
+    T_reference_scan = {name: T for name, (T, _) in given.items()}
+    try:
+        progress = stage(job.progress, 0.4, 0.75, "registering")
+        registered = register_object(clouds, reference, starts, progress)
+    except Refused as error:
+        if not settings.fixed:
+            raise
+        nan = float("nan")
+        pairs = {
+            (name, reference): Registration(T, nan, nan, 0.0, nan, nan, nan, "initial", fixed[name])
+            for name, T in T_reference_scan.items()
+            if name != reference
+        }
+        alignment = MultiwayAlignment(reference, T_reference_scan, fixed, pairs, [], {}, {}, {})
+        none = {name: np.zeros_like(cloud.mask) for name, cloud in clouds.items()}
+        machine = [PlacedByMachine(name, True, why=str(error)) for name, _ in pairs]
+        return ObjectAlignment(alignment, clouds, none, {}), machine
+    found = registered.alignment.on_reference() if given else {}
+    checks = {
+        name: compare_place(given[name], each.T_reference_scan, each.uncertainty)
+        for name, each in found.items()
+    }
+    machine = [PlacedByMachine(name, settings.fixed, **vars(each)) for name, each in checks.items()]
+    if settings.fixed:
+        alignment = replace(
+            registered.alignment, T_reference_scan=T_reference_scan, uncertainties=fixed
+        )
+        registered = replace(registered, alignment=alignment)
+    return registered, machine
 
 
 def _read_clouds(job: Job, settings: MergeSettings) -> tuple[str, dict[str, Cloud]]:
@@ -239,7 +324,10 @@ def _read_clouds(job: Job, settings: MergeSettings) -> tuple[str, dict[str, Clou
         made = reconstruct_captures(job, fitted, own)
         clouds = {shot.name: restrict_cloud(store, shot.name, c, region) for shot, _, c in made}
         model = fitted.name
-    return model, {n: clouds[n] if n in own else scan_cloud(job, n, roi=roi) for n in names}
+    found = {n: clouds[n] if n in own else scan_cloud(job, n, roi=roi) for n in names}
+    if kept := dict.fromkeys(name for cloud in found.values() for name in cloud.scalars):
+        job.warn(f"a merge holds no {', '.join(kept)}: export the scans for these")
+    return model, found
 
 
 @contextmanager
@@ -380,13 +468,18 @@ def _make_registered(scan: str, onto: str, registration: Registration) -> Regist
     return Registered(
         scan=scan,
         onto=onto,
-        point_to_point_rms_mm=registration.inlier_rmse_mm,
+        point_to_point_rms_mm=_known(registration.inlier_rmse_mm),
         sigma_shift_mm=uncertainty.shift_mm,
         sigma_turn_deg=uncertainty.turn_deg,
         middle=to_vector(uncertainty.centre),
         T_reference_scan=to_matrix(registration.T_reference_scan),
-        **{name: getattr(registration, name) for name in same},
+        **{name: _known(getattr(registration, name)) for name in same},
     )
+
+
+def _known(value: Any) -> Any:
+    """Return a figure, None for NaN: of a scan that no surface places."""
+    return None if value != value else value
 
 
 def _list_table_angles(store: Session, settings: MergeSettings) -> dict[str, float] | None:

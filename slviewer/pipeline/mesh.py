@@ -91,7 +91,7 @@ class MeshSettings(Callbacks):
     Args:
         session: Session folder.
         names: One scan; several, to be merged into the frame of the first; or a merge of the
-            session, as merge/1.
+            session, as merge/1 or merge 1.
         out: The file; by default a .ply in the session's exports, with a texture a .glb.
         texture: Side of a texture image, px, such as 2048, projected from the scans onto the mesh;
             for .glb and .obj.
@@ -144,8 +144,14 @@ class MeshSettings(Callbacks):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """The scans, or the merge, each once."""
-        return tuple(dict.fromkeys(self.names))
+        """The scans, or the merge, each once; ``merge 1`` is ``merge/1``."""
+        match tuple(dict.fromkeys(self.names)):
+            case (Merge.kind,):
+                return (MERGED,)
+            case (Merge.kind, number) if number.isdigit():
+                return (f"{MERGED}{number}",)
+            case names:
+                return names
 
 
 @takes_settings(MeshSettings)
@@ -178,7 +184,7 @@ def mesh(settings: MeshSettings) -> MeshResult:
             with merge_scans(job, merging) as merged:
                 shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
         elif sources[0].startswith(MERGED):
-            name = merge_name(store, sources[0].removeprefix(MERGED))
+            name = merge_name(store, sources[0])
             stored, points = read_merge(store, f"merge/{name}", warn, settings.roi)
             shape, restrictions = points_with_normals(points), tuple(stored.restrictions)
         else:
@@ -223,7 +229,7 @@ def _textured_scans(
     (source,) = settings.sources
     if isinstance(shape, Cloud):
         return {source: shape}, {source: np.eye(4)}
-    made = load_record(store, Merge, merge_name(store, source.removeprefix(MERGED)))
+    made = load_record(store, Merge, merge_name(store, source))
     for name in made.scans:
         store.load_capture(name).require_frames("texture")
     used = made.model or settings.model

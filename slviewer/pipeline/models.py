@@ -313,7 +313,8 @@ def _restore_or_compile(store: Session, model: SplinedModel, content: str) -> No
         with suppress(SessionError, KeyError):  # damaged: it is compiled again
             meta, arrays = store.load_result(COMPILED)
             if (meta["inputs"], meta["version"]) == (inputs, COMPILED_VERSION):
-                model.restore_compiled(meta["compiled"], arrays)
+                with decoding(COMPILED):
+                    model.restore_compiled(meta["compiled"], arrays)
                 return
     if store.is_writable:
         compiled, arrays = model.compile_depth()
@@ -412,7 +413,7 @@ def load_stereo_verdict(store: Session) -> Verdict | None:
     return imported or load_record(store, ModelCalibration, "stereo").verdict
 
 
-def check_accepted(store: Session, accept_rejected: bool = False) -> None:
+def check_accepted(store: Session, accept_rejected: bool) -> None:
     """Raise CalibrationRejected, with the reason, where the calibration was rejected and that is
     not accepted."""
     reason = rejection_reason(store)

@@ -257,7 +257,7 @@ def is_up_to_date(store: Session, result: str) -> bool:
 def _has_scales(store: Session, record: Record) -> bool:
     """Whether the corrections of scale in a record, and in those that it was made from, are in
     force; calibrations are made without any."""
-    made_from = (each.partition("/") for each in record.inputs)
+    made_from = (each.partition("/") for each, used in record.inputs.items() if used)
     return all(scale_factor(store, model) == used for model, used in record.scales.items()) and all(
         _has_scales(store, load_record(store, all_kinds()[kind], name))
         for kind, _, name in made_from

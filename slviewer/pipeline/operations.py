@@ -1,12 +1,8 @@
 """All operations by the names of their commands: whoever looks one up imports them from here."""
 
-from slviewer.pipeline import (  # noqa: F401 (each registers its own)
-    accept,
-    calibrate,
-    compare,
-    inspect_parts,
-    measure,
-    merge,
-    reconstruct,
-)
+from slviewer import pipeline
+from slviewer.entry_points import OPERATION_PLUGINS, import_modules
 from slviewer.pipeline.operation import OPERATIONS as OPERATIONS
+
+import_modules(pipeline, "\n@operation(")
+_ = OPERATION_PLUGINS.plugins

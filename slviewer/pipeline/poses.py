@@ -4,7 +4,7 @@ the session as `poses/<name>` and `evidence/<name>`."""
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, cast
 
 import numpy as np
@@ -16,7 +16,7 @@ from slviewer.calibration.diagnosis.frames import (
     measure_motion_px,
     measure_white_delay,
 )
-from slviewer.calibration.diagnosis.numbering import detect_grid_size
+from slviewer.calibration.diagnosis.numbering import detect_grid_size, place_by_neighbours
 from slviewer.calibration.observe import (
     AXES,
     READING_VERSION,
@@ -25,8 +25,9 @@ from slviewer.calibration.observe import (
     observe,
     pitch_px,
 )
-from slviewer.errors import BoardError, DamagedError, InputError
+from slviewer.errors import BoardError, DamagedError, DetectionError, InputError
 from slviewer.examination.light import Look
+from slviewer.fringe.image_area import ImageArea, fill_dead
 from slviewer.fringe.phase import PhaseMaps
 from slviewer.fringe.sequence import Axis, PatternSequence, Size
 from slviewer.geometry.polynomial import fit_polynomial
@@ -45,14 +46,16 @@ from slviewer.records.record import to_plain
 from slviewer.records.verdict import Cause, Examination, Finding
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
-from slviewer.target.board import Board
-from slviewer.target.detect import Detection, board_mask, detect
+from slviewer.target.board import Board, Detection
+from slviewer.target.detect import board_mask, detect
 
 LINES_DEGREE = 5
 """Of the polynomial through a board's features: perspective and distortion leave less than
 noise."""
-EVIDENCE_VERSION = 12
+EVIDENCE_VERSION = 14
 """Version of the examination; evidence that was stored by another version is computed again."""
+NEAR_LINE = 0.4
+"""Distance from a dead line, in pitches, within which a feature may be displaced by the line."""
 POSES_AT_ONCE = 2
 """Poses read side by side: most of the work on one occupies one thread."""
 
@@ -73,15 +76,53 @@ class DecodedPose:
     matched: PhaseMaps | None = None
     fault: str = ""
 
+    @cached_property
+    def image(self) -> np.ndarray:
+        """The texture without the image's bars, its dead lines and pixels filled."""
+        return cut_area(self.texture, self.look.area)
+
+    def detect(self) -> Detection:
+        """Detect the board in the image without its bars; features on its dead lines are skipped.
+        Raises DetectionError."""
+        return detect_in_area(self.board, self.image, self.look.area)
+
+
+def cut_area(image: np.ndarray, area: ImageArea) -> np.ndarray:
+    """Return an image (h, w) or (h, w, 3) without its area's bars, dead lines and pixels filled."""
+    u0, v0, u1, v1 = area.box
+    return fill_dead(image, area)[v0:v1, u0:u1]
+
+
+def detect_in_area(
+    board: Board, image: np.ndarray, area: ImageArea, several: bool = True
+) -> Detection:
+    """Detect a board in what ``cut_area`` returned, in pixels of the whole image; features on dead
+    lines are skipped. ``several`` as in `detect`. Raises DetectionError."""
+    try:
+        detection = detect(board, image, several=several)
+    except DetectionError as error:
+        if constant := area.describe_cut():
+            error.observation += f" (of the image without {constant})"
+        raise
+    pixels = detection.pixels + np.array(area.box[:2])
+    reach = NEAR_LINE * pitch_px(board, detection)
+    keep = np.ones(len(pixels), bool)
+    for axis, place in area.lines.tolist():
+        keep &= np.abs(pixels[:, axis] - place) > reach
+    others = detection.others[:, keep] if len(detection.others) else detection.others
+    return replace(detection, pixels=pixels[keep], ids=detection.ids[keep], others=others)
+
 
 @dataclass(frozen=True)
 class Judged:
-    """A pose's observation, or None and the reason (``refused``)."""
+    """A pose's observation, or None and the reason (``refused``); ``note``: what else is in view
+    and not used."""
 
     name: str
     observation: Observation | None
     refused: str = ""
     evidence: PoseEvidence | None = None
+    note: str = ""
 
 
 def read_pose(
@@ -104,11 +145,11 @@ def read_pose(
     try:
         if pose.fault:
             raise InputError(pose.fault)
-        detection = detect(pose.board, pose.texture)
-        observation = observe(name, pose.board, detection, pose.matched or phases, smoothing)
+        detection, area = pose.detect(), pose.look.area
+        observation = observe(name, pose.board, detection, pose.matched or phases, smoothing, area)
         if pose.matched and len(phases) == 2:
             with suppress(InputError):  # the cameras do without
-                light = observe(name, pose.board, detection, phases, smoothing)
+                light = observe(name, pose.board, detection, phases, smoothing, area)
                 observation = replace(observation, light=light)
         if observed is not None:
             observed(observation)
@@ -127,7 +168,8 @@ def read_pose(
     evidence = None
     if checked is not None:
         evidence = gather_evidence(pose, checked, detection, observation, refused, misfit)
-    return Judged(name, None if refused else observation, refused, evidence)
+    note = detection.note if detection else ""
+    return Judged(name, None if refused else observation, refused, evidence, note)
 
 
 def read_stored_pose(
@@ -144,7 +186,8 @@ def read_stored_pose(
     matched, fault = None, ""
     try:
         if capture.second:
-            lines = partial(board_lines, board, next(iter(phases)), texture)
+            first = fill_dead(texture, look.area)
+            lines = partial(board_lines, board, next(iter(phases)), first)
             matched = match_second(capture, phases, lines)
     except InputError as error:
         fault = str(error)
@@ -155,7 +198,7 @@ def read_stored_pose(
     inputs = {capture.name: capture.hash}
     evidence = {"evidence": to_plain(judged.evidence), "inputs": inputs}
     store.save_result(f"evidence/{capture.name}", _evidence_settings(board) | evidence, {})
-    reading = {"refused": judged.refused, "inputs": inputs}
+    reading = {"refused": judged.refused, "note": judged.note, "inputs": inputs}
     arrays = judged.observation.to_arrays() if judged.observation else {}
     store.save_result(
         f"poses/{capture.name}", _reading_settings(board, smoothing) | reading, arrays
@@ -215,7 +258,8 @@ def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -
         """Return the reading, if it is current."""
         if not _reading_settings(board, smoothing).items() <= meta.items():
             return None
-        return Judged(name, _decode_observation(name, meta, arrays), meta["refused"], evidence)
+        observation = _decode_observation(name, meta, arrays)
+        return Judged(name, observation, meta["refused"], evidence, meta.get("note", ""))
 
     evidence = store.decode_fresh(f"evidence/{name}", decode_evidence, only=())
     return None if evidence is None else store.decode_fresh(f"poses/{name}", decode)
@@ -262,13 +306,13 @@ def read_stored_poses(
 
 
 def load_observations(store: Session, names: Sequence[str]) -> list[Observation]:
-    """Load the stored observations of the named poses."""
+    """Load the stored observations of the named poses, numbered as the calibration did."""
     observations = []
     for name in names:
         if store.has_result(f"poses/{name}"):
             observation = store.decode_result(f"poses/{name}", partial(_decode_observation, name))
             observations += [] if observation is None else [observation]
-    return observations
+    return place_by_neighbours(observations)
 
 
 def _decode_observation(
@@ -295,7 +339,7 @@ def gather_evidence(
     detection: Detection | None,
     observation: Observation | None,
     refused: str,
-    misfit: Finding | None = None,
+    misfit: Finding | None,
 ) -> PoseEvidence:
     """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
     None where they could not be read, for the reason ``refused``; ``misfit``: by which
@@ -305,7 +349,7 @@ def gather_evidence(
     grid, on_board, moved_px = None, None, np.nan
     is_oriented = False
     if detection is None:
-        grid = detect_grid_size(board, pose.texture)
+        grid = detect_grid_size(board, pose.image)
     else:
         is_marked = detection.marked and board.columns != board.rows  # a square has no mirror image
         is_oriented = is_marked or board.kind == "charuco"

@@ -15,6 +15,7 @@ from slviewer.errors import DetectionError, InputError, UsageError
 from slviewer.evaluation.fit import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.vectors import finite_rows
 from slviewer.inputs import RADIUS
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.cloud_corrections import (
@@ -133,19 +134,22 @@ def reconstruct(job: Job, settings: ReconstructSettings) -> Iterator[Found[Recon
 
 @contextmanager
 def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[ReconstructedCapture]:
-    """Context manager: a reconstructed capture, not stored yet; its file gets its place at the
-    end."""
+    """Context manager: a capture whose frames become a cloud. It is not stored yet; its file gets
+    its place at the end."""
     job, store, capture = job.accepting(settings), job.store, settings.capture
-    warn = job.warn
     store.load_capture(capture).require_frames("reconstruct")
     check_calibration(job)
     name = settings.model or preferred_model(store)
     check_capture_sizes(store, [capture])
+
+    # frames to the phase of each axis: one that repeats is made absolute by the depths
     job.progress(0.1, "reading and decoding")
     shot, frames, decoded = next(
-        decode_captures(store, [capture], warn, relative=True, check=settings.check)
+        decode_captures(store, [capture], job.warn, relative=True, check=settings.check)
     )
-    phases = absolute_phases(store, capture, decoded, settings.depth_range, warn)
+    phases = absolute_phases(store, capture, decoded, settings.depth_range, job.warn)
+
+    # phases to a cloud; that of a board pose by every model, which are compared there
     is_pose = shot.role == "calibration"
     texture = capture_texture(shot, frames, stretch=is_pose)
     chosen = load_models(store, () if is_pose and settings.model is None else (name,))
@@ -157,18 +161,17 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
         )
         for n, m in chosen.items()
     }
-    cloud, region = clouds[name], segment_board(store, shot, texture, warn) if is_pose else None
-    restrictions, board = tuple[str, ...](), tuple[str, ...]()
+
+    # cloud to the points that are written: inside the board's outline, or what edits and the
+    # region of interest leave
+    cloud, region = clouds[name], None
+    restrictions, flatness = tuple[str, ...](), tuple[str, ...]()
     if not is_pose:
         box = resolve_region(store, settings.roi)
         cloud = restrict_cloud(store, capture, cloud, box)
         restrictions = restriction_notes(store, [capture], box)
-    if region is not None:
-        illuminated = phases[next(iter(clouds.values())).axis].illuminated
-        depths = load_stereo(store).depth_range_mm
-        fit = fit_clouds("plane", clouds, illuminated, region=region, depth_range=depths)
-        tables = Verification.tables({capture: fit.record()})
-        board = "inside the board's outline:", *map(render_text, tables)
+    elif (region := segment_board(store, shot, texture, job.warn)) is not None:
+        flatness = _describe_flatness(store, capture, clouds, phases, region)
     written = cloud.supported() if settings.supported_only else cloud
     mask = written.mask if region is None else written.mask & region
     if not mask.any():
@@ -177,15 +180,33 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
             "does the calibration belong to this camera and projector, and is the scene within its"
             " depths?",
         )
+
+    # points to the file, which appears once the caller has stored the record
     job.progress(0.8, "writing")
     points = int(np.count_nonzero(mask))
     found = cloud_record(store, settings, chosen[name], clouds[name], phases[cloud.axis], region)
     origin = f"calibration {name}", *restrictions
     with _write_files(store, settings, written, mask, origin) as path:
-        notes = (*restrictions, f"{points:,} points -> {path}", *board)
+        notes = (*restrictions, f"{points:,} points -> {path}", *flatness)
         found = replace(found, files=(path,), notes=notes)
         yield ReconstructedCapture(found, cloud.supported(), points)
     job.progress(1.0, "reconstructed")
+
+
+def _describe_flatness(
+    store: Session,
+    capture: str,
+    clouds: Mapping[str, Cloud],
+    phases: PhaseMaps,
+    region: np.ndarray,
+) -> tuple[str, ...]:
+    """Return how flat each model's cloud of a board pose is in the board's ``region`` (h, w)
+    bool, as tables for the terminal."""
+    illuminated = phases[next(iter(clouds.values())).axis].illuminated
+    depths = load_stereo(store).depth_range_mm
+    fit = fit_clouds("plane", clouds, illuminated, region=region, depth_range=depths)
+    tables = Verification.tables({capture: fit.record()})
+    return "inside the board's outline:", *map(render_text, tables)
 
 
 @contextmanager
@@ -232,7 +253,7 @@ def segment_board(
         return None
     board = Board.parse(notation)
     try:
-        detection = detect(board, texture)
+        detection = detect(board, texture, several=True)
     except DetectionError as error:
         warn(f"{shot.name}: {error}")
         return None
@@ -431,8 +452,8 @@ def absolute_phases(
     store: Session,
     name: str,
     phases: PhaseMaps,
-    depth_range: tuple[float, float] | None = None,
-    warn: Warn = ignore_warnings,
+    depth_range: tuple[float, float] | None,
+    warn: Warn,
 ) -> PhaseMaps:
     """Return a capture's phases, ambiguous ones made absolute by the depth range (near, far) mm of
     the scene; by default the calibrated one. An axis that more than one depth fits is solved by the
@@ -522,16 +543,28 @@ def scan_cloud(job: Job, name: str, model: str | None = None, roi: str = "") -> 
         for message in lens_warnings(store, capture):
             job.warn(message)
         misfit = Misfit.pop_from(arrays)
+        if "scalars" in arrays:
+            values = np.moveaxis(arrays["scalars"], -1, 0)
+            arrays["scalars"] = dict(zip(meta["imported"]["scalars"], values, strict=True))
         cloud = Cloud(axis=meta["axis"], model=meta["model"], misfit=misfit, **arrays).supported()
     else:
         *_, cloud = next(reconstruct_captures(job, load_model(store, model), [name]))
     return restrict_cloud(store, name, cloud, region)
 
 
+def load_origin(store: Session, scan: str) -> np.ndarray | None:
+    """Return the origin (3,) mm that the coordinates of an imported scan count from; None where
+    nothing was subtracted."""
+    stored = f"clouds/{scan}"
+    meta = store.load_meta(stored) if store.has_result(stored) else {}
+    origin = (meta.get("imported") or {}).get("origin_mm")
+    return None if origin is None else np.array(origin)
+
+
 def merge_name(store: Session, name: str) -> str:
-    """The merge of that number, or the last one where none is named; raises InputError where it
-    does not exist."""
-    there = numbered_names(store, "merge")
+    """The merge of that number, ``1`` or ``merge/1``, or the last one where none is named; raises
+    InputError where it does not exist."""
+    name, there = name.removeprefix(f"{Merge.kind}/"), numbered_names(store, "merge")
     if not there:
         raise InputError("there is no merge yet", "merge scans first")
     if name and name not in there:
@@ -539,7 +572,7 @@ def merge_name(store: Session, name: str) -> str:
     return name or there[-1]
 
 
-def read_merge(store: Session, result: str, warn: Warn, roi: str = "") -> tuple[Merge, Ply]:
+def read_merge(store: Session, result: str, warn: Warn, roi: str) -> tuple[Merge, Ply]:
     """The record and the points of a merge that the session stores as ``merge/<number>``; warns of
     a stale one. Raises UsageError where a region ``roi`` was stated: its scans were cut when it was
     made."""
@@ -561,7 +594,7 @@ def points_with_normals(merged: Ply) -> PointSet:
     merge without any."""
     if merged.normals is None:
         raise InputError("the merged cloud has no normals", "merge the scans again")
-    known, sigma = np.isfinite(merged.normals).all(axis=1), merged.scalars.get("sigma")
+    known, sigma = finite_rows(merged.normals), merged.scalars.get("sigma")
     if sigma is not None and not np.isfinite(sigma[known]).all():
         sigma = None
     return PointSet(

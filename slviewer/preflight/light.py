@@ -50,52 +50,44 @@ def _grab_images(bench: RigUnderTest, grey: int | None) -> tuple[np.ndarray, np.
 
 
 _TARGET_LEVEL = 0.85  # of full scale, for the 99.5th percentile of what is illuminated
-_SATURATED_FACTOR = (
-    0.5  # the excess of a saturated image is unknown: half of it, then measure again
-)
+_SATURATED_FACTOR = 0.5  # of the exposure: by how much it is too long is unknown, so measure again
 
 
 def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
-    """Check the exposure; return the check and the exposure in ms to set, None where it is right or
-    unknown."""
-    level, full, clip = bench.white[bench.illuminated], bench.full, bench.clip
-    bright = float(np.quantile(level, 0.995))
-    clipped = float(np.mean(level >= clip))
+    """Check how bright white light is in what the projector illuminates.
+
+    Returns the check, and the exposure in ms to set, None where it is right or unknown.
+    """
+    level = bench.white[bench.illuminated]
     black = float(np.median(bench.dark[bench.illuminated]))
-    present = bench.read_exposure_ms()
-    factor = (
-        _SATURATED_FACTOR
-        if bright >= clip
-        else (_TARGET_LEVEL * full - black) / max(bright - black, 1.0)
-    )
-    wanted = None if present is None else float(f"{present * factor:.3g}")
+    bright, clipped = float(np.quantile(level, 0.995)), float(np.mean(level >= bench.clip))
+    factor, share = _SATURATED_FACTOR, bright / bench.full
+    if bright < bench.clip:
+        factor = (_TARGET_LEVEL * bench.full - black) / max(bright - black, 1.0)
+    present, wanted = bench.read_exposure_ms(), None
+    change = f"Multiply the exposure by {factor:.2g}"
+    if present is not None:
+        wanted = float(f"{present * factor:.3g}")
+        change = f"Change the exposure from {present:g} ms to {wanted:g} ms"
     figures = {
-        "bright_share_of_full_scale": round(bright / full, 3),
+        "bright_share_of_full_scale": round(share, 3),
         "clipped_share": round(clipped, 4),
         "median_contrast_levels": round(bench.contrast, 1),
         "exposure_ms": present,
         "suggested_exposure_ms": wanted,
         "suggested_factor": round(factor, 2),
     }
-    change = (
-        f"Multiply the exposure by {factor:.2g}"
-        if wanted is None
-        else f"Change the exposure from {present:g} ms to {wanted:g} ms"
-    )
     if clipped > CLIPPED:
         verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         text = f"{100 * clipped:.1f} % of what the projector lights is saturated in white light."
-        if bright < clip:
-            remedy = "Turn what shines, or capture with two exposures."
-            return Check("exposure", verdict, text, remedy, figures), None
         return Check("exposure", verdict, text, f"{change}, then check again.", figures), wanted
-    if bright < WEAK * full:
-        verdict = "bad" if bright < TOO_WEAK * full else "warning"
-        text = f"White light reaches only {100 * bright / full:.0f} % of the camera's range."
+    if share < WEAK:
+        verdict = "bad" if share < TOO_WEAK else "warning"
+        text = f"White light reaches only {100 * share:.0f} % of the camera's range."
         return Check("exposure", verdict, text, f"{change}, or open the aperture.", figures), wanted
     text = (
-        f"White light reaches {100 * bright / full:.0f} % of the camera's range;"
-        f" {100 * clipped:.1f} % is saturated."
+        f"White light reaches {100 * share:.0f} % of the camera's range; {100 * clipped:.1f} % is"
+        " saturated."
     )
     return Check("exposure", "good", text, "", figures), None
 

@@ -15,6 +15,7 @@ from slviewer.fringe.presets import bits_for, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, Kind, PatternSequence
 from slviewer.pipeline.examination import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
+from slviewer.printable import capitalize
 from slviewer.records.verdict import ORDER_CAUSES, Examination, Finding
 
 MISPLACING_CAUSES = (*ORDER_CAUSES, "ghosting")
@@ -70,7 +71,7 @@ def rate_findings(findings: Iterable[Finding]) -> CheckVerdict:
 
 def format_sentence(text: str) -> str:
     """Return an observation or a remedy as a sentence; "" for none."""
-    return f"{text[:1].upper()}{text[1:]}." if text else ""
+    return text and f"{capitalize(text)}."
 
 
 def check_burst(bench: RigUnderTest) -> Check:

@@ -35,7 +35,7 @@ from slviewer.pipeline.examination import (
     examine_frames,
     name_frames,
 )
-from slviewer.pipeline.operation import Progress, ignore_progress, part
+from slviewer.pipeline.operation import Progress, part
 from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import (
     MISPLACING_CAUSES,
@@ -67,7 +67,7 @@ _FEW, _TOO_FEW = 0.75, 0.25
 most is lost."""
 
 
-def preflight_capture(capture: Capture, progress: Progress = ignore_progress) -> Preflight:
+def preflight_capture(capture: Capture, progress: Progress) -> Preflight:
     """Check the rig of a capture from its frames, with the messages of `check_rig.preflight`; of
     two cameras as `Preflight.join`."""
     if capture.second is None:
@@ -152,10 +152,8 @@ def _check_response(
     gamma, steps = gamma_from_harmonic(known[axis]), axis_layout(sequence, axis).steps
     shown = np.linspace(0, 255, 18)
     response = (shown / 255) ** gamma
-    curved, error = (
-        measure_nonlinearity(shown, response),
-        predict_phase_error(shown, response, steps),
-    )
+    curved = measure_nonlinearity(shown, response)
+    error = predict_phase_error(shown, response, steps)
     figures = {
         "second_harmonic": {a: round(h, 4) for a, h in known.items()},
         "gamma": round(gamma, 3),

@@ -10,6 +10,7 @@ import numpy as np
 
 from slviewer.devices.protocols import Rig, find_full_scale, report_driver_faults
 from slviewer.fringe.layout import image_white
+from slviewer.geometry.robust import robust_sigma
 
 _PIXELS = 150_000
 """So many pixels of an image are looked at."""
@@ -114,10 +115,7 @@ class RigUnderTest:
             bursts.append(self.grab_spread(_MEAN)[1])
         dark, white = bursts
         self.dark, self.white = dark.mean(axis=0), white.mean(axis=0)
-        difference = white[1] - white[0]
-        self.noise = (
-            float(np.median(np.abs(difference - np.median(difference)))) / 0.6745 / math.sqrt(2)
-        )
+        self.noise = robust_sigma(white[1] - white[0]) / math.sqrt(2)
         # Light that flickers lifts whole images, and must not pass for the projector's.
         swing = max(float(np.std([np.median(image) for image in images])) for images in bursts)
         self.illuminated = self.white - self.dark > max(

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from slviewer.geometry.robust import robust_sigma
 from slviewer.pipeline.examination import Check
 from slviewer.preflight.light import Burst
 from slviewer.preflight.rig_under_test import RigUnderTest
@@ -27,7 +28,7 @@ def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> C
         return Check("motion", "unknown", "Motion cannot be seen: too little is illuminated.")
     blocks = grids[:, measured]
     blocks = np.stack([_match_light(image, blocks[0]) for image in blocks])
-    noise = 1.4826 * float(np.median(np.abs(np.diff(blocks[1:-1], axis=0)))) / np.sqrt(2)
+    noise = robust_sigma(np.diff(blocks[1:-1], axis=0), 0.0) / np.sqrt(2)
     limit = max(_SIGMAS * np.sqrt(2) * noise, _CHANGE * bench.contrast)
     moved = (np.abs(blocks[1:] - blocks[0]) > limit).mean(axis=1)
     share = float(moved.max())

@@ -23,6 +23,7 @@ from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.vectors import finite_rows
 
 STEPS = 12
 """Of the search from the table's pixel to the one that has the numbers; smooth surfaces need two or
@@ -155,7 +156,7 @@ def _find(
     ``sigma_1``, ``sigma_2``: their standard deviations.
     """
     out = np.full((*first.shape[:2], 4), np.nan)
-    known = second[np.isfinite(second).all(axis=-1)]
+    known = second[finite_rows(second)]
     if not len(known):
         return out
     low = known.min(axis=0)

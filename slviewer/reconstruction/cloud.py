@@ -1,6 +1,6 @@
 """A cloud that keeps the camera's grid: neighbours in the image are neighbours on the surface."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -67,7 +67,8 @@ class Cloud:
     camera's range (10, 12, 14 or 16 bits, whichever holds its brightest pixel). ``normals``: (h, w,
     3) float32 of imported points, which lie in rows without being neighbours, in the frame of their
     file; their ``model`` is "", and ``sigma_z`` along these normals. ``fill``: of two cameras, what
-    the projector measured where the second one does not see.
+    the projector measured where the second one does not see. ``scalars``: other values (h, w) of
+    imported points by name.
     """
 
     points: Points
@@ -81,6 +82,7 @@ class Cloud:
     normals: Points | None = None
     extrapolated: Mask | None = None
     fill: ProjectorFill | None = None
+    scalars: dict[str, Map] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("points", "sigma_z", "sigma_calibration", "sigma_edges", "normals"):
@@ -147,7 +149,7 @@ class Cloud:
         """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them:
         ``sigma_noise``, where the model knows it ``sigma_calibration``, and with that or a misfit
         ``sigma``, all together; mm of z. Where there are such points, ``extrapolated`` is 1 of
-        these and 0 of the others."""
+        these and 0 of the others. The `scalars` of imported points follow."""
         scalars = {"sigma_noise": self.sigma_z[chosen]}
         if self.sigma_calibration is not None:
             scalars["sigma_calibration"] = self.sigma_calibration[chosen]
@@ -155,7 +157,7 @@ class Cloud:
             scalars["sigma"] = self.sigma[chosen]
         if self.extrapolated is not None:
             scalars["extrapolated"] = self.extrapolated[chosen].astype(np.float32)
-        return scalars
+        return scalars | {name: values[chosen] for name, values in self.scalars.items()}
 
     @property
     def rgb(self) -> np.ndarray | None:

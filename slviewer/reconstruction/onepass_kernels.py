@@ -68,11 +68,9 @@ def sweep_rows(
     for first in range(start, stop, ROWS):
         last = min(first + ROWS, stop)
         A, psi = background[: last - first], wrapped[: last - first]
-        phase, B, reason = (
-            maps.phase[first:last],
-            maps.modulation[first:last],
-            maps.reason[first:last],
-        )
+        phase = maps.phase[first:last]
+        B = maps.modulation[first:last]
+        reason = maps.reason[first:last]
         if len(rules.gray):
             coded_rows(stack, shifts, scale, rules, first, phase, psi, B, A, reason)
         else:
@@ -88,27 +86,21 @@ def _measure(first, last, background, depths, scale, per_step, maps):
     """Compute points and their depth noise by each pixel's rational function, and the grid's
     correction, if any."""
     one, zero, none = np.float32(1), np.float32(0), np.float32(np.nan)
-    gain, centre, c, grid = (
-        np.float32(depths.gain),
-        np.float32(depths.centre),
-        depths.c,
-        depths.grid,
-    )
+    gain = np.float32(depths.gain)
+    centre = np.float32(depths.centre)
+    c = depths.c
+    grid = depths.grid
     # the phase's standard deviation is the square root of the noise's variance times 2/n, over the
     # modulation
     squared, least_B = per_step * gain * gain, np.float32(1e-6)
     noise_a, noise_b = np.float32(scale.noise_a) * squared, np.float32(scale.noise_b) * squared
-    near, per_mm, deepest = (
-        np.float32(depths.near),
-        np.float32(depths.per_mm),
-        np.float32(grid.shape[2] - 1.0001),
-    )
+    near = np.float32(depths.near)
+    per_mm = np.float32(depths.per_mm)
+    deepest = np.float32(grid.shape[2] - 1.0001)
     width = maps.phase.shape[1]
-    z, cell, rest = (
-        np.empty(width, np.float32),
-        np.empty(width, np.int32),
-        np.empty(width, np.float32),
-    )
+    z = np.empty(width, np.float32)
+    cell = np.empty(width, np.int32)
+    rest = np.empty(width, np.float32)
     for row in range(first, last):
         phase, A, B = maps.phase[row], background[row - first], maps.modulation[row]
         c0, c1, c2, ray_x, ray_y = c[0, row], c[1, row], c[2, row], c[3, row], c[4, row]

@@ -1,6 +1,7 @@
 """From absolute phase and a calibration to an organised cloud, and to the triangles of its grid."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -15,7 +16,6 @@ from slviewer.reconstruction.cloud import Cloud, Map, Points
 EDGE_SIGMAS = 10.0
 """Standard deviations of noise, beyond which the error that blur makes at an edge masks a pixel;
 smaller ones are part of its uncertainty."""
-Measured = tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]
 
 JUMP = 0.01
 """A neighbour this much nearer or deeper (share of the depth) belongs to another surface."""
@@ -101,16 +101,11 @@ def reconstruct_cloud(
             f" {_join_axes(model.axes)}",
             "capture along an axis that is calibrated, or calibrate with the captured one.",
         )
-    measured = {each: _measure(model, phases[each], extrapolates) for each in axes}
-    axis = _select_axis(measured)
-    points, sigma_z, edges, extrapolated = measured[axis]
-    sigma_calibration = (
-        model.sigma_calibration(axis, points) if isinstance(model, KnowsErrors) else None
-    )
-    return Cloud(
-        points, axis, model.name, sigma_z, texture, sigma_calibration, edges,
-        extrapolated=extrapolated,
-    )  # fmt: skip
+    cloud = _select_axis([_measure(model, phases[each], extrapolates) for each in axes])
+    sigma = None
+    if isinstance(model, KnowsErrors):
+        sigma = model.sigma_calibration(cloud.axis, cloud.points)
+    return replace(cloud, texture=texture, sigma_calibration=sigma)
 
 
 def normals(points: Points, reach: int = 2) -> Points:
@@ -132,11 +127,13 @@ def cloud_normals(cloud: Cloud) -> Points:
     return normals(cloud.points) if cloud.normals is None else cloud.normals
 
 
-def _measure(model: Model, phase: PhaseMap, extrapolates: bool) -> Measured:
-    """Points (h, w, 3) mm, NaN where the camera's blur spoils the phase at an edge; the standard
-    deviation (h, w) mm of their depth, from the phase noise and from what the calibration's own
-    phases scatter by beyond theirs; the error (h, w) mm of the depth that blur makes at edges, None
-    for Gray code alone; and which points (h, w) bool are extrapolated, None where none are."""
+def _measure(model: Model, phase: PhaseMap, extrapolates: bool) -> Cloud:
+    """Return the points of one axis, without those where the camera's blur spoils the phase at an
+    edge.
+
+    Their standard deviation is from the phase noise and from what the calibration's own phases
+    scatter by beyond theirs; what blur makes at edges is not known for Gray code alone.
+    """
     if phase.is_relative:
         raise InputError(
             f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px",
@@ -156,34 +153,32 @@ def _measure(model: Model, phase: PhaseMap, extrapolates: bool) -> Measured:
     if excess > 0.0:
         noise_px = np.hypot(noise_px, np.float32(excess))
         sigma = per_px * noise_px
-    if phase.steps == 0:
-        return points, sigma, None, _keep_any(extrapolated)
-    spoilt = remaining_px > EDGE_SIGMAS * noise_px
-    points[spoilt], sigma[spoilt] = np.nan, np.nan
-    if extrapolated is not None:
-        extrapolated &= ~spoilt
-    return points, sigma, per_px * remaining_px, _keep_any(extrapolated)
+    edges = None
+    if phase.steps:
+        edges, spoilt = per_px * remaining_px, remaining_px > EDGE_SIGMAS * noise_px
+        points[spoilt], sigma[spoilt] = np.nan, np.nan
+        if extrapolated is not None:
+            extrapolated &= ~spoilt
+    if extrapolated is not None and not extrapolated.any():
+        extrapolated = None
+    return Cloud(
+        points, phase.axis, model.name, sigma, sigma_edges=edges, extrapolated=extrapolated
+    )
 
 
-def _keep_any(mask: np.ndarray | None) -> np.ndarray | None:
-    """Return a mask, or None where it selects nothing."""
-    return mask if mask is not None and mask.any() else None
-
-
-def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
-    """Return the axis with the lowest median sigma where both are valid, else the one with most
-    valid pixels."""
-    axes = list(measured)
-    valid = {
-        axis: np.isfinite(points[..., 2])
-        & np.isfinite(sigma)
-        & (True if extrapolated is None else ~extrapolated)
-        for axis, (points, sigma, _, extrapolated) in measured.items()
-    }
-    both = np.logical_and.reduce(list(valid.values()))
+def _select_axis(clouds: Sequence[Cloud]) -> Cloud:
+    """Return the cloud of the axis with the lowest median sigma where both are valid, else the one
+    with most valid pixels; what is extrapolated is not."""
+    valid = [
+        np.isfinite(cloud.points[..., 2])
+        & np.isfinite(cloud.sigma_z)
+        & (True if cloud.extrapolated is None else ~cloud.extrapolated)
+        for cloud in clouds
+    ]
+    both = np.logical_and.reduce(valid)
     if both.any():
-        return min(axes, key=lambda axis: float(np.median(measured[axis][1][both])))
-    return max(axes, key=lambda axis: int(valid[axis].sum()))
+        return min(clouds, key=lambda cloud: float(np.median(cloud.sigma_z[both])))
+    return clouds[int(np.argmax([each.sum() for each in valid]))]
 
 
 def _join_axes(axes: PhaseMaps | tuple[Axis, ...]) -> str:

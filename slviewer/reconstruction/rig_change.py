@@ -87,7 +87,7 @@ class PointResponse:
 
     @classmethod
     def from_cloud(
-        cls, cloud: Cloud, rig: StereoRig, residual_px: float, scale: float = 1.0
+        cls, cloud: Cloud, rig: StereoRig, residual_px: float, scale: float
     ) -> "PointResponse | None":
         """Return the response of a cloud's points, enlarged by ``scale``; None for too few."""
         reference = subsample(cloud.measured, MAX_REFERENCE_POINTS).astype(np.float64) / scale

@@ -254,12 +254,10 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
 
     def table(self) -> Table:
         """Return the results of the adjustment, and notes on its poses."""
-        noise, local, covered, sigma = (
-            self.noise_px,
-            self.local_distortion_rms_px,
-            self.cells_lit,
-            self.sigma_volume_mm,
-        )
+        noise = self.noise_px
+        local = self.local_distortion_rms_px
+        covered = self.cells_lit
+        sigma = self.sigma_volume_mm
         low, high = self.board_height_mm
         near, far = sigma.depths_mm
         u, v, z = sigma.worst_at

@@ -45,12 +45,18 @@ class Quantity:
     def format(self) -> str:
         """Return value ± U (k = 2) with the unit; a star where the calibration's part of U is
         unknown."""
-        digits = 1 if self.unit == "%" else 3
+        digits = 1 if self.unit == "%" else _count_decimals([self])
         unit = {"deg": "°", "%": " %", "": ""}.get(self.unit, f" {self.unit}")
         # no minus before nothing
         value = f"{round(self.value, digits) + 0.0:.{digits}f}".replace("-", "−")
         U = "" if self.U is None else f" ± {self.U:.{digits}f}"
         return f"{value}{U}{unit}{'*' if U and not self.whole else ''}"
+
+
+def _count_decimals(quantities: Sequence[Quantity]) -> int:
+    """Return the decimals that show two digits of each U; 3 to 6."""
+    least = min((q.U for q in quantities if q.U), default=1.0)
+    return int(np.clip(1 - np.floor(np.log10(least)), 3, 6))
 
 
 What = Literal[
@@ -64,10 +70,12 @@ RULE = (
     " them and their expanded uncertainty (k = 2) together stay within the tolerance, fail if one"
     " exceeds it by more than the uncertainty, else too close to tell"
 )
-_UNCERTAINTY = (
-    "U is the expanded uncertainty: the scatter of the points, and the calibration's uncertainty."
-    " –: a residual or a plain reading, which has none."
+_UNCERTAINTY = "U is the expanded uncertainty: the scatter of the points, and the calibration's."
+_SCATTER = (
+    "U is the expanded uncertainty of the scatter of the points alone: the calibration's part is"
+    " unknown."
 )
+_NO_UNCERTAINTY = "–: a residual or a plain reading, which has no U."
 
 
 class MeasuredFeature(msgspec.Struct, frozen=True):
@@ -543,15 +551,16 @@ def _settings_of_comparison(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 def list_quantities(found: Mapping[str, Measurement]) -> Table:
     """Return the table of all quantities of measurements."""
+    digits = _count_decimals([q for each in found.values() for q in each.quantities])
     rows = [
         {
             "measurement": name,
             Column("type", detail=True): each.what,
             "scan": each.source,
             "quantity": q.name,
-            Column("value", digits=4): q.value,
+            Column("value", digits=digits): q.value,
             "unit": q.unit,
-            Column("U (k=2)", digits=4): q.U,
+            Column("U (k=2)", digits=digits): q.U,
             Column("calibration in U", detail=True): (
                 None if q.U is None else "yes" if q.whole else "no"
             ),
@@ -560,15 +569,23 @@ def list_quantities(found: Mapping[str, Measurement]) -> Table:
         for name, each in found.items()
         for k, q in enumerate(each.quantities)
     ]
-    partial = [
-        name
+    warnings = [f"{name}: {warning}." for name, each in found.items() for warning in each.warnings]
+    return Table.of(rows, "Measured on the scans", [*_describe_uncertainty(found), *warnings])
+
+
+def _describe_uncertainty(found: Mapping[str, Measurement]) -> list[str]:
+    """Return what U of the measurements states, in sentences."""
+    stated = {  # name: whether its U are whole
+        name: all(q.whole for q in each.quantities if q.U is not None)
         for name, each in found.items()
-        if any(q.U is not None and not q.whole for q in each.quantities)
-    ]
-    notes = [
-        _UNCERTAINTY,
-        *(f"{name}: {warning}." for name, each in found.items() for warning in each.warnings),
-    ]
-    if partial:
-        notes.append(f"U lacks the calibration's part, which is unknown: {', '.join(partial)}.")
-    return Table.of(rows, "Measured on the scans", notes)
+        if any(q.U is not None for q in each.quantities)
+    }
+    sentences = []
+    if stated:
+        sentences.append(_UNCERTAINTY if any(stated.values()) else _SCATTER)
+    if any(stated.values()) and not all(stated.values()):
+        partial = ", ".join(name for name, whole in stated.items() if not whole)
+        sentences.append(f"U of {partial} lacks the calibration's part, which is unknown.")
+    if any(q.U is None for each in found.values() for q in each.quantities):
+        sentences.append(_NO_UNCERTAINTY)
+    return sentences

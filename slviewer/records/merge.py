@@ -94,7 +94,8 @@ class ProjectorFill(msgspec.Struct, frozen=True):
 
 class ImportedPoints(msgspec.Struct, frozen=True):
     """Where an imported cloud is from: name, hash and unit of its file, what the normals and the
-    standard deviation of its points rest on, in words, and notes on what was dropped or added."""
+    standard deviation of its points rest on, in words, and notes on what was dropped or added.
+    ``scalars``: names of the other values of its points; ``origin_mm``: where they count from."""
 
     file: str
     hash: str
@@ -102,6 +103,20 @@ class ImportedPoints(msgspec.Struct, frozen=True):
     normals: str
     sigma: str
     notes: tuple[str, ...] = ()
+    scalars: tuple[str, ...] = ()
+    origin_mm: tuple[float, float, float] | None = None
+
+    def text(self) -> str:
+        """Describe where the points are from."""
+        parts = [f"from {self.file} in {self.unit}", self.normals, self.sigma]
+        if self.scalars:
+            parts.append(f"kept: {', '.join(self.scalars)}")
+        if self.origin_mm is not None:
+            x, y, z = self.origin_mm
+            parts.append(
+                f"coordinates less the origin {x:.10g} {y:.10g} {z:.10g} mm, which export adds"
+            )
+        return "; ".join((*parts, *self.notes))
 
 
 class Reconstruction(Record, frozen=True, kw_only=True):
@@ -124,7 +139,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     worth; None where no such depths are known.
     ``fill``: of two cameras, what the projector measured where the second one does not see.
     ``imported``: of points from a file, in rows that mean nothing; their arrays are ``points``,
-    ``normals`` (h, w, 3), ``sigma_z`` along these, and ``texture`` where they have colours.
+    ``normals`` (h, w, 3), ``sigma_z`` along these, and where they have such ``texture``, and
+    ``scalars`` (h, w, k), which ``imported`` names.
     """
 
     kind = "clouds"
@@ -197,8 +213,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             )
         if self.fill and (text := self.fill.text()):
             yield text
-        if (i := self.imported) is not None:
-            yield "; ".join((f"from {i.file} in {i.unit}", i.normals, i.sigma, *i.notes))
+        if self.imported is not None:
+            yield self.imported.text()
 
     @classmethod
     def tables(cls, found: Mapping[str, "Reconstruction"]) -> list[Table]:  # type: ignore[override]
@@ -260,11 +276,12 @@ def rests_on_start(scan: str, onto: str, start: str, rival_mm: float) -> str:
 class Registered(msgspec.Struct, frozen=True, kw_only=True):
     """The registration of one scan onto another: RMS along the normal, and from point to point;
     ``overlap``, 0 to 1; one standard deviation of the pose at ``middle``, the centre of the
-    overlap. ``rival_mm``: distance of another pose that fits as well: the ``start`` decided."""
+    overlap. Of a scan that the machine alone places, RMS is None. ``rival_mm``: distance of another
+    pose that fits as well: the ``start`` decided."""
 
     scan: str = ""
     onto: str = ""
-    rms_mm: float
+    rms_mm: float | None
     overlap: float
     T_reference_scan: Matrix4
     point_to_point_rms_mm: float | None = None
@@ -333,16 +350,49 @@ class ContradictingPair(msgspec.Struct, frozen=True):
     gate_mm: float
 
 
+class PlacedByMachine(msgspec.Struct, frozen=True):
+    """How far the surfaces place a scan beside its place by the machine, and U of that (k = 2);
+    whether they ``agrees``, and whether the machine's place ``is_used``. Without figures, ``why``
+    the surfaces do not show it."""
+
+    scan: str
+    is_used: bool
+    shift_mm: float | None = None
+    turn_deg: float | None = None
+    U_mm: float | None = None
+    U_deg: float | None = None
+    agrees: bool = True
+    why: str = ""
+
+    def text(self) -> str:
+        """Describe the comparison."""
+        used = "the machine's place is used" if self.is_used else "the surfaces' place is used"
+        if self.shift_mm is None:
+            return f"{self.scan}: {used}, and the surfaces do not show whether it holds: {self.why}"
+        stated = (
+            f"{self.scan}: the surfaces place it {self.shift_mm:.3g} mm and {self.turn_deg:.2g}°"
+            f" beside the machine's pose (U {self.U_mm:.2g} mm and {self.U_deg:.2g}°); {used}"
+        )
+        if self.agrees:
+            return stated
+        return (
+            f"{stated}. They contradict each other: see that the pose belongs to this scan, that"
+            " part and scanner did not move on their mounts, and that the machine is as accurate as"
+            " stated"
+        )
+
+
 class Merge(Record, frozen=True, kw_only=True):
     """Scans registered onto one of them, and fused into one surface, by the joint adjustment of all
     pairs.
 
     ``pairs``: every scan but the reference on it; ``registered``: the pairs that the merge was made
     from; ``loops`` that these close, the worst first; ``dropped``: pairs that the others
-    contradict. ``static_points`` stand still while the object moves; ``left_out``: {scan: {why:
-    points}}; ``shared``: share of the ``points`` seen by several scans. ``depths``: of scans that
-    are partly outside the calibrated depths. ``ply``: the file in the session's exports; ``scale``,
-    ``restrictions``: correction of scale, edits and region in words.
+    contradict. ``machine``: scans placed by a machine. ``static_points`` stand still while the
+    object moves; ``left_out``: {scan: {why: points}}; ``shared``: share of the ``points`` seen by
+    several scans. ``depths``: of scans that are partly outside the calibrated depths. ``ply``: the
+    file in the session's exports; ``scale``, ``restrictions``: correction of scale, edits and
+    region in words.
     """
 
     kind = "merge"
@@ -359,6 +409,7 @@ class Merge(Record, frozen=True, kw_only=True):
     dropped: list[RefusedPair] = []
     refused: list[RefusedPair] = []
     markers: list[MarkerPair] = []
+    machine: list[PlacedByMachine] = []
     static_points: dict[str, Count] = {}
     contradictions: list[ContradictingPair] = []
     left_out: dict[str, dict[str, Count]] = {}
@@ -374,8 +425,8 @@ class Merge(Record, frozen=True, kw_only=True):
 
     @property
     def is_good(self) -> bool:
-        """Whether the scans are within the calibrated depths."""
-        return not self.depths
+        """Whether the scans are within the calibrated depths, and where a machine has them."""
+        return not self.depths and all(each.agrees for each in self.machine)
 
     @classmethod
     def upgrade(cls, meta: Meta) -> Meta:
@@ -400,7 +451,9 @@ class Merge(Record, frozen=True, kw_only=True):
     def summary(self) -> str:
         """Return RMS and overlap of each scan on the reference."""
         pairs = (
-            f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %"
+            f"{n} placed by the machine"
+            if p.rms_mm is None
+            else f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %"
             for n, p in self.pairs.items()
         )
         merged = f"merged on {self.reference}: {'; '.join(pairs)}"
@@ -414,6 +467,7 @@ class Merge(Record, frozen=True, kw_only=True):
             f"{p.scan} on {p.onto} {key}": getattr(p, key)
             for p in self.registered
             for key in ("rms_mm", "overlap")
+            if p.rms_mm is not None
         }
         return {"points": float(self.points), **pairs}
 
@@ -423,7 +477,10 @@ class Merge(Record, frozen=True, kw_only=True):
         rows = []
         for pair in sorted(self.registered, key=lambda p: self.reference not in (p.scan, p.onto)):
             marks = marked.get((pair.scan, pair.onto))
-            overlap = Cell(100 * pair.overlap, "" if pair.overlap >= MIN_OVERLAP else "worse")
+            is_enough = pair.overlap >= MIN_OVERLAP or pair.rms_mm is None
+            overlap = Cell(
+                None if pair.rms_mm is None else 100 * pair.overlap, "" if is_enough else "worse"
+            )
             rows.append(
                 {
                     "scan": pair.scan,
@@ -469,6 +526,7 @@ class Merge(Record, frozen=True, kw_only=True):
             if each.rival_mm is not None
         ]
         notes += [f"{scan}: {each.text()}." for scan, each in self.depths.items()]
+        notes += [f"{each.text()}." for each in self.machine]
         notes += [f"Excluded: {each.why}." for each in self.dropped]
         notes += [
             f"Not registered: {each.scan} onto {each.onto}: {each.why}." for each in self.refused

@@ -42,6 +42,7 @@ Cause = Literal[
     "gamma",
     "too-few-poses",
     "parallel-poses",
+    "constant-pixels",
     "empty-corner",
     "uncertain",
     "residuals",

@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from slviewer.geometry.rigid import Floats, Uncertainty, move_points, rigid_transform
 from slviewer.registration.refusal import Refused
 
-_FLOOR_MM, _FLOOR_DEG = 0.003, 0.002
-"""Least standard deviation of an edge, however many points it has."""
-_LEVER_MM = 100.0
-"""Length that converts angles to mm, so that all unknowns are of one scale."""
+_FLOOR, _FLOOR_DEG = 3e-5, 0.002
+"""Least standard deviation of an edge, over the scans' size, however many points it has."""
+_LEVER = 1.0
+"""Over the scans' size: converts angles to mm, so that all unknowns are of one scale."""
 _TREES = 200
-_RIM_MM = 50.0
+_RIM = 1 / 2
 _GAP_SIGMAS = 8.0
 _GAP_GATES = 0.5
 """A loop is inconsistent where its gap exceeds both 8 times the expected gap and half the
@@ -33,7 +33,7 @@ class Edge:
     ``onto``.
 
     ``covariance`` (6, 6): of a small rotation (rad) about ``centre`` (3,) mm and a translation
-    (mm), in that frame. ``gate_mm``: of the registration.
+    (mm), in that frame. ``size_mm``: of the scans. ``gate_mm``: of the registration.
     """
 
     scan: int
@@ -41,7 +41,8 @@ class Edge:
     T: Floats
     covariance: Floats
     centre: Floats
-    gate_mm: float = 1.0
+    size_mm: float
+    gate_mm: float = 0.0
 
     @property
     def ends(self) -> frozenset[int]:
@@ -49,10 +50,23 @@ class Edge:
         return frozenset((self.scan, self.onto))
 
     @property
+    def lever_mm(self) -> float:
+        """Length that converts the rotation to mm."""
+        return _LEVER * self.size_mm
+
+    @property
+    def floor(self) -> Floats:
+        """(6, 6): least covariance."""
+        return np.diag(np.repeat([np.radians(_FLOOR_DEG), _FLOOR * self.size_mm], 3) ** 2)
+
+    @property
     def variance(self) -> float:
-        """Variance in mm^2 of the translation plus that of the rotation at a lever of 100 mm."""
-        total = np.trace(self.covariance[3:, 3:]) + _LEVER_MM**2 * np.trace(self.covariance[:3, :3])
-        return float(total + _FLOOR_MM**2 + (_LEVER_MM * np.radians(_FLOOR_DEG)) ** 2)
+        """Variance in mm^2 of the translation plus that of the rotation at the lever."""
+        total = np.trace(self.covariance[3:, 3:]) + self.lever_mm**2 * np.trace(
+            self.covariance[:3, :3]
+        )
+        floor = (_FLOOR * self.size_mm) ** 2 + (self.lever_mm * np.radians(_FLOOR_DEG)) ** 2
+        return float(total + floor)
 
 
 class LoopGap(NamedTuple):
@@ -177,7 +191,7 @@ def _is_consistent(edge: Edge, edges: Sequence[Edge], before: np.ndarray, poses:
     pairs = {edge.ends, *map(frozenset, pairwise(loop_nodes(edge, before)))}
     variance = sum(each.variance for each in edges if each.ends in pairs)
     gap = loop_gap(edge, poses)
-    at_rim = gap.shift_mm + np.radians(gap.turn_deg) * _RIM_MM
+    at_rim = gap.shift_mm + np.radians(gap.turn_deg) * _RIM * edge.size_mm
     return bool(at_rim <= max(_GAP_SIGMAS * np.sqrt(variance), _GAP_GATES * edge.gate_mm))
 
 
@@ -195,9 +209,11 @@ def pose_uncertainties(poses: Floats, edges: Sequence[Edge], root: int) -> list[
     It grows with the distance from the root along the graph; the root's own is 0.
     """
     _, cost, middle = _build_problem(poses, edges, root)
-    steps = np.eye(6 * (len(poses) - 1)) * 1e-3
-    J = np.stack([(cost(step) - cost(-step)) / 2e-3 for step in steps], axis=1)
-    unit = np.repeat([1 / _LEVER_MM, 1.0], 3)
+    lever = edges[0].lever_mm
+    small = 1e-5 * lever
+    steps = np.eye(6 * (len(poses) - 1)) * small
+    J = np.stack([(cost(step) - cost(-step)) / (2 * small) for step in steps], axis=1)
+    unit = np.repeat([1 / lever, 1.0], 3)
     covariance = np.linalg.inv(J.T @ J)
     blocks = [
         covariance[k : k + 6, k : k + 6] * np.outer(unit, unit) for k in range(0, len(steps), 6)
@@ -217,9 +233,8 @@ def _build_problem(
     ``cost(x)`` the edges' residuals in sigmas.
     """
     free = [node for node in range(len(poses)) if node != root]
-    floor = np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_MM**2] * 3)
     whitening = np.linalg.inv(
-        np.linalg.cholesky(np.array([edge.covariance for edge in edges]) + floor)
+        np.linalg.cholesky(np.array([edge.covariance + edge.floor for edge in edges]))
     )
     middle = np.mean(
         [move_points(poses[edge.onto], edge.centre[None])[0] for edge in edges], axis=0
@@ -228,7 +243,7 @@ def _build_problem(
     def apply_step(x: Floats) -> Floats:
         """Return the poses (n, 4, 4) moved by the unknowns."""
         rotation, translation = x.reshape(-1, 2, 3).transpose(1, 0, 2)
-        R = Rotation.from_rotvec(rotation / _LEVER_MM).as_matrix()
+        R = Rotation.from_rotvec(rotation / edges[0].lever_mm).as_matrix()
         moved = poses.copy()
         moved[free] = rigid_transform(R, translation + middle - R @ middle) @ poses[free]
         return moved

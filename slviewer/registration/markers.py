@@ -27,9 +27,9 @@ from slviewer.target.coded import detect_markers
 
 CORNER_PX = 0.05
 """Standard deviation of a corner in the image, beyond which its own residuals speak."""
-MOVED_SIGMAS, MOVED_MM, MOVED_MEDIANS = 6.0, 0.1, 4.0
-"""A marker whose corners are further from where the others put them, in standard deviations, mm,
-and medians of all markers, has been moved."""
+MOVED_SIGMAS, MOVED_SHARE, MOVED_MEDIANS = 6.0, 5e-4, 4.0
+"""A marker whose corners are further from where the others put them, in standard deviations, over
+all markers' extent, and in medians of all markers, has been moved."""
 MOST_GAP = 0.005
 """Of the markers' extent: where their gaps are larger in the median, no motion explains them."""
 LEAST_CORNER_POINTS = 40
@@ -197,16 +197,18 @@ def _select_steady(p: Floats, q: Floats, sigma: Floats) -> Mask:
     gaps = _largest_gaps(starts, p, q)
     gap = gaps[np.median(gaps, axis=1).argmin()]
     steady = gap <= np.median(gap)
+    extent = diagonal(q.reshape(-1, 3))
     for _ in range(4):
         T = _fit_pose(p[steady], q[steady], sigma[steady])
         gap = _largest_gaps(T, p, q)
         usual = float(np.median(gap))
-        limit = np.maximum(MOVED_SIGMAS * sigma.max(axis=1), max(MOVED_MM, MOVED_MEDIANS * usual))
+        limit = np.maximum(
+            MOVED_SIGMAS * sigma.max(axis=1), max(MOVED_SHARE * extent, MOVED_MEDIANS * usual)
+        )
         steady = gap < limit
         if steady.sum() < 2:
             break
-    extent = diagonal(q.reshape(-1, 3))
-    return steady & (usual < max(MOVED_MM, MOST_GAP * extent))
+    return steady & (usual < MOST_GAP * extent)
 
 
 def _fit_pose(p: Floats, q: Floats, sigma: Floats) -> Floats:

@@ -401,7 +401,8 @@ class _PoseGraphBuilder:
         return [
             Edge(
                 self.names.index(scan), self.names.index(onto), result.T_reference_scan,
-                result.uncertainty.covariance, result.uncertainty.centre, result.gate_mm,
+                result.uncertainty.covariance, result.uncertainty.centre, self.size,
+                result.gate_mm,
             )
             for (scan, onto), result in self.registered.items()
         ]  # fmt: skip

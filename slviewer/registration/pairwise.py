@@ -13,7 +13,7 @@ import numpy as np
 
 from slviewer.geometry.rigid import Floats, Uncertainty, move_points
 from slviewer.geometry.vectors import rms, subsample
-from slviewer.registration.markers import MOVED_MM, MarkerPose
+from slviewer.registration.markers import MOVED_SHARE, MarkerPose
 from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.refine import (
     WORDS,
@@ -24,16 +24,16 @@ from slviewer.registration.refine import (
     refine_pose,
 )
 from slviewer.registration.refusal import Refused
-from slviewer.registration.scan import PreparedScan, scale_of
+from slviewer.registration.scan import PreparedScan
 from slviewer.registration.small_feature import hold_by_feature
 from slviewer.registration.start import SEARCHED, Candidate, Start, pose_distance, search_starts
 
 Progress = Callable[[float], None]
 
-LEVELS_MM = ((2.0, 8.0), (1.0, 2.0))
-"""Voxel and gate for objects of 75 to 300 mm, coarse to fine; the last stage, ``refine``, goes on
-from there."""
-LAST_GATE_MM = 1.0
+LEVELS = ((1 / 50, 4 / 50), (1 / 100, 1 / 50))
+"""Voxel and gate over the object's size, coarse to fine; the last stage, ``refine``, goes on from
+there."""
+LAST_GATE = 1 / 100
 LEAST_OVERLAP = 0.15
 LEAST_AGREEMENT = 0.8
 MOST_ATTEMPTS = 3
@@ -86,7 +86,7 @@ def register_prepared(
     scan: PreparedScan,
     reference: PreparedScan,
     size: float,
-    start: Candidate | list[Candidate] | None = None,
+    start: Candidate | list[Candidate] | None,
     markers: MarkerPose | None = None,
     progress: Progress = lambda share: None,
 ) -> Registration:
@@ -160,7 +160,7 @@ def _register_by_markers(
             f"The scans hardly overlap, and the markers that both show ({len(markers.ids)}) leave"
             f" {error:.2g} mm open: let both see three markers or more, well apart.",
         )
-    gate = max(MOVED_MM, 2.0 * reference.spacing)
+    gate = max(MOVED_SHARE * size, 2.0 * reference.spacing)
     pose = RefinedPose(markers.T, gate, uncertainty)
     figures, _ = _compute_figures(scan, reference, pose, "markers")
     return replace(
@@ -190,18 +190,17 @@ def _align_start(
     markers: MarkerPose | None = None,
 ) -> tuple[Registration, Freedom]:
     """Run ICP from an initial pose, and compute its figures and the freedom of the overlap."""
-    scale = scale_of(size)
     T = start.T
     # of the distance of two corresponding points
     noise = float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
-    for voxel, gate in LEVELS_MM:
-        widest = max(gate * scale, 2.0 * max(scan.spacing, reference.spacing), 3.0 * noise)
+    for voxel, gate in LEVELS:
+        widest = max(gate * size, 2.0 * max(scan.spacing, reference.spacing), 3.0 * noise)
         # else it starts within a fraction of a millimetre, and a plane would slide
         if markers is None:
             loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
-            thinned = scan.thinned(voxel * scale), reference.thinned(voxel * scale)
+            thinned = scan.thinned(voxel * size), reference.thinned(voxel * size)
             T = align_icp(*thinned, T, widest, loss, 1e-6, 40)
-    narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * noise)
+    narrowest = max(LAST_GATE * size, 3.0 * noise)
     pose = refine_pose(scan, reference, T, widest, narrowest, markers)
     return _compute_figures(scan, reference, pose, start.start)
 

@@ -28,7 +28,7 @@ from slviewer.registration.scan import PreparedScan
 Shape = Literal["plane", "sphere", "cylinder", "slides", "turns"]
 
 _STEPS = 12
-_SETTLED_MM, _NEAR_MM = 2e-3, 5e-3
+_SETTLED, _NEAR = 1e-5, 3e-5  # of the overlap's diagonal
 _FIRST_POINTS, _MOST_POINTS = 8_000, 40_000
 _MIN_COSINE = 0.8  # between the normals of a pair
 _MIN_PAIRS = 60
@@ -89,8 +89,8 @@ def refine_pose(
         step = -np.linalg.lstsq(e.H, e.gradient, rcond=1e-10)[0]
         T = turn_about(step[:3], e.centre, step[3:]) @ T
         next_gate = min(gate, max(3.0 * e.sigma, narrowest))
-        motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * diagonal(pairs[0])
-        if next_gate > 0.99 * gate and motion < (_SETTLED_MM if stride == least else _NEAR_MM):
+        motion = np.linalg.norm(step[3:]) / diagonal(pairs[0]) + np.linalg.norm(step[:3])
+        if next_gate > 0.99 * gate and motion < (_SETTLED if stride == least else _NEAR):
             if stride == least:
                 steps_left = 0
                 continue

@@ -15,8 +15,8 @@ from slviewer.geometry.vectors import lengths, median_spacing, thin_out
 from slviewer.registration.open3d_loader import open3d, point_cloud
 
 LEAST_POINTS = 500
-FINEST_MM = 0.5
-"""Thinned to one point in so many mm, of objects of 75 to 300 mm: the noise of several pixels is
+FINEST = 1 / 200
+"""Thinned to one point in such a share of the object's size: the noise of several pixels is
 averaged."""
 _GRAZING = np.cos(np.radians(75.0))
 _RIM_PX = 2
@@ -161,7 +161,7 @@ def prepare_scan(
         raise InputError(
             f"Nearly all points of the {name} are one", "give those that were measured, each once."
         )
-    voxel = FINEST_MM * scale_of(size)
+    voxel = FINEST * size
     fine = _make_cloud(points, normals, voxel, has_camera)
     if len(fine.points) < LEAST_POINTS // 5:
         raise InputError(
@@ -172,11 +172,6 @@ def prepare_scan(
     spacing = median_spacing(cKDTree(np.asarray(fine.points)), 2000)
     spacing /= np.sqrt(len(points) / len(fine.points))
     return PreparedScan(points, fine, voxel, float(spacing), size, sigma_mm)
-
-
-def scale_of(size: float) -> float:
-    """Return the factor of voxels and gates for an object of ``size`` mm; 1 from 75 to 300 mm."""
-    return size / float(np.clip(size, 75.0, 300.0))
 
 
 def measure_size(points: np.ndarray) -> float:

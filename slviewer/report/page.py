@@ -262,7 +262,7 @@ def finish_figure(drawing: Any, caption: str, alt: str) -> Figure:
 
 
 def style_axes(
-    axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK
+    axes: Any, title: str, x: str = "", y: str = "", *, grid: bool = True, colour: str = INK
 ) -> None:
     """Style axes plainly: a light grid, two spines, labels in the page's sizes; ``x`` and ``y``
     name the axes."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.evaluation.letter import find_pose
+from slviewer.geometry.vectors import finite_rows
 from slviewer.records.record import DEPTHS
 from slviewer.records.verification import Verification
 from slviewer.report.page import (
@@ -266,7 +267,7 @@ def _convex_hull(points: np.ndarray) -> np.ndarray:
     """The corners (m, 3), in order, of the convex hull of points close to one plane."""
     from scipy.spatial import ConvexHull
 
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     centred = points - points.mean(axis=0)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)
     return points[ConvexHull(centred @ directions[:2].T).vertices]

@@ -13,6 +13,7 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
+from slviewer.printable import capitalize
 from slviewer.records.acceptance import (
     MARKS,
     AcceptanceTest,
@@ -151,7 +152,7 @@ def session_title(data: SessionData) -> tuple[str, str]:
         ("calibrated with", states.count("used"), "target pose"),
     ]
     listed = ", ".join(f"{verb} {format_count(n, noun)}" for verb, n, noun in counts if n)
-    return data.details.part or data.name, f"{listed[:1].upper()}{listed[1:]}." if listed else ""
+    return data.details.part or data.name, listed and f"{capitalize(listed)}."
 
 
 def make_title_page(data: SessionData) -> TitlePage:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.geometry.vectors import subsample, thin_out
+from slviewer.geometry.vectors import finite_rows, subsample, thin_out
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.records.measurement import NominalDeviation
 from slviewer.report.page import (
@@ -40,10 +40,8 @@ BACKGROUND = (246, 248, 250)
 def view_rotation(yaw_deg: float, pitch_deg: float) -> NDArray[np.float64]:
     """(3, 3) rotation of camera-frame points into the view's frame: the viewer steps aside by yaw
     and up by pitch."""
-    turn, tilt = (
-        cv2.Rodrigues(np.radians([0, yaw_deg, 0]))[0].T,
-        cv2.Rodrigues(np.radians([pitch_deg, 0, 0]))[0],
-    )
+    turn = cv2.Rodrigues(np.radians([0, yaw_deg, 0]))[0].T
+    tilt = cv2.Rodrigues(np.radians([pitch_deg, 0, 0]))[0]
     return np.asarray(tilt @ turn)
 
 
@@ -62,7 +60,7 @@ def render_points(
     """
     width, height = size
     background = np.array(BACKGROUND, np.float32) / 255
-    known = np.isfinite(points).all(axis=1)
+    known = finite_rows(points)
     if known.sum() < 3:
         return np.full((height, width, 3), BACKGROUND, np.uint8)
     view = points[known] @ rotation.T

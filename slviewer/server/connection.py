@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
-from websockets.exceptions import InvalidHandshake
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Response
 
 from slviewer.server.access import Role
@@ -109,4 +109,4 @@ def quiet_logger() -> logging.Logger:
 def _is_server_error(record: logging.LogRecord) -> bool:
     """Whether a log record reports an error other than a failed handshake or a lost connection."""
     error = record.exc_info[1] if record.exc_info else None
-    return not isinstance(error, InvalidHandshake | ConnectionError)
+    return not isinstance(error, InvalidHandshake | ConnectionClosed | ConnectionError)

@@ -45,6 +45,26 @@
     childList: true,
     subtree: true,
   });
+  // A button's hint stands in the view, beside the panel: there it covers no other control, as the browser's own would.
+  const hint = document.createElement("div");
+  hint.id = "hint";
+  let hinted = null, title = "";
+  document.addEventListener("pointerover", ({ target }) => {
+    if (target.matches?.("input[aria-haspopup=listbox]")) target.title = target.scrollWidth > target.clientWidth ? target.value : "";
+    const button = target.closest?.("button[id]");
+    if (button === hinted) return;
+    if (hinted) hinted.title = title;
+    hint.remove();
+    hinted = null;
+    if (!button?.title || !view) return;
+    [hinted, title] = [button, button.title];
+    button.title = "";
+    hint.textContent = title;
+    const box = button.getBoundingClientRect(), { left, right } = view.getBoundingClientRect();
+    const side = box.left >= right - 1 ? { right: `${innerWidth - right + 6}px`, left: "auto" } : { left: `${left + 6}px`, right: "auto" };
+    Object.assign(hint.style, { top: `${box.top}px`, maxWidth: `${right - left - 12}px`, ...side });
+    document.body.append(hint);
+  });
   document.addEventListener("click", ({ target }) => {
     const marker = target.closest(CORNER)?.previousSibling.firstChild; // the corner: a new picture may have come meanwhile
     if (marker) marker.dataset.live = liveSize = marker.dataset.live === "large" ? "small" : "large";

@@ -49,14 +49,48 @@ const FLOOR = { false: [[225, 229, 233], [190, 196, 202]], true: [[42, 45, 48], 
         }
       };
       onmessage.set.call(this, ({ data }) => {
+        wakeView();
         if (waiting.push(data) === 1) turn.port2.postMessage(null);
       });
     },
   });
 })();
+// viser's client draws the view at every refresh of the screen. Here it rests while nothing can have changed the view: no
+// message has come, and nobody has done anything.
+const wakeView = (() => {
+  const AWAKE_MS = 1500, REST_MS = 10000;
+  const request = requestAnimationFrame.bind(window), cancel = cancelAnimationFrame.bind(window);
+  const waiting = new Map(), requested = new Map(); // by our own number
+  let number = 0, until = performance.now() + 20000; // the page starts
+  const pass = (id, draw) => {
+    waiting.delete(id);
+    requested.set(id, request((time) => requested.delete(id) && draw(time)));
+  };
+  window.requestAnimationFrame = (draw) => {
+    if (performance.now() < until) pass(++number, draw);
+    else waiting.set(++number, draw);
+    return number;
+  };
+  window.cancelAnimationFrame = (id) => {
+    waiting.delete(id);
+    cancel(requested.get(id));
+    requested.delete(id);
+  };
+  const passAll = () => waiting.forEach((draw, id) => pass(id, draw));
+  const wake = (ms = AWAKE_MS) => {
+    until = Math.max(until, performance.now() + ms);
+    passAll();
+  };
+  setInterval(passAll, REST_MS); // what no event has announced
+  for (const kind of ["pointermove", "pointerdown", "pointerup", "wheel", "keydown", "keyup", "input", "change", "drop", "load"])
+    addEventListener(kind, () => wake(), { capture: true, passive: true });
+  for (const kind of ["resize", "focus", "visibilitychange"]) addEventListener(kind, () => wake());
+  return wake;
+})();
 // viser warns at every start, in a large box that stays, that the scene is drawn in software. It asks for the renderer's
 // name first: here it gets none, and one line says so, once in a browser.
 (() => {
+  if (!globalThis.WebGL2RenderingContext) return;
   const noted = "slviewer drawn in software";
   const prototype = WebGL2RenderingContext.prototype;
   const getExtension = prototype.getExtension;
@@ -71,7 +105,8 @@ const FLOOR = { false: [[225, 229, 233], [190, 196, 202]], true: [[42, 45, 48], 
       line.setAttribute("role", "status");
       line.textContent = "3D is drawn in software, slowly: switch on the browser's hardware acceleration.";
       Object.assign(line.style, {
-        position: "fixed", bottom: "4px", left: "50%", transform: "translateX(-50%)", zIndex: "10",
+        position: "fixed", bottom: "200px", left: "calc(100vw - var(--view-right) - var(--view-width) + 10px)", zIndex: "4",
+        maxWidth: "max(calc(var(--view-width) - 290px), 200px)",
         font: "12px sans-serif", color: "#495057", background: "#ffffffd9", padding: "2px 8px", borderRadius: "4px",
       });
       document.body.append(line);
@@ -83,10 +118,33 @@ const FLOOR = { false: [[225, 229, 233], [190, 196, 202]], true: [[42, 45, 48], 
 // viser writes the address of its WebSocket into the page's own, unless it has no path. Here every page has one, and the
 // address stays as it is.
 history.replaceState = () => {};
-// Files and folders that are dropped on the page are handed to its input for imports; several, folders and images as one zip.
+// Shows a line in the middle of the page; an empty text removes it.
+const showNotice = (text) => {
+  let line = document.getElementById("page-notice");
+  if (!text) return line?.remove();
+  if (!line) {
+    line = document.body.appendChild(document.createElement("div"));
+    line.id = "page-notice";
+    line.setAttribute("role", "status");
+  }
+  line.textContent = text;
+};
+// Back leaves the page only where it is pressed twice. (A browser passes over an entry that was made without an act of the user.)
+(() => {
+  const keep = () => addEventListener("pointerdown", () => history.pushState(null, ""), { once: true, capture: true });
+  keep();
+  addEventListener("popstate", () => {
+    showNotice("Back leaves the wizard: press it once more. The session and what runs in it go on.");
+    setTimeout(showNotice, 5000);
+    keep();
+  });
+})();
+// Files and folders that are dropped on the page, or chosen in the dialog of one of its inputs for imports, are handed to that
+// input; several, folders and images as one zip.
 (() => {
   const input = 'input[type=file][accept^=".zip,.ply"]';
-  const image = /\.(bmp|jpe?g|pgm|png|tiff?|webp)$/i;
+  const FOLDER = ",folder"; // behind the types of an input whose dialog takes a folder
+  const image = /\.(arw|bmp|cr[23]|dng|jpe?g|nef|nrw|orf|pef|p[gp]m|png|raf|rw2|tiff?|webp)$/i;
   const table = Uint32Array.from({ length: 256 }, (_, n) => {
     for (let k = 0; k < 8; k++) n = n & 1 ? 0xedb88320 ^ (n >>> 1) : n >>> 1;
     return n;
@@ -113,6 +171,7 @@ history.replaceState = () => {};
     const parts = [], directory = [];
     let offset = 0;
     for (const { path, file } of files) {
+      showNotice(`Reading ${files.length} files, ${Math.round((100 * parts.length) / 3 / files.length)} % …`);
       const name = new TextEncoder().encode(path);
       const sizes = [[4, file.size], [4, file.size], [2, name.length], [2, 0]];
       const about = [[2, 20], [2, 0x800], [2, 0], [2, 0], [2, 33], [4, await checksum(file)], ...sizes];
@@ -124,9 +183,12 @@ history.replaceState = () => {};
     const end = pack([4, 0x06054b50], [2, 0], [2, 0], [2, count], [2, count], [4, size], [4, offset], [2, 0]);
     return new Blob([...parts, ...directory, end]);
   };
-  const list = async (entry) => {
+  // own: the file itself of what is dropped. Without a path, as other programs may hand it over, Chromium has no entry for it, and
+  // WebKit one that cannot be read.
+  const list = async (entry, own) => {
+    if (!entry) return [{ path: own.name, file: own }];
     if (entry.isFile) {
-      const file = await new Promise((done, failed) => entry.file(done, failed));
+      const file = await new Promise((done, failed) => entry.file(done, own ? () => done(own) : failed));
       return [{ path: entry.fullPath.slice(1), file }];
     }
     const found = [];
@@ -136,22 +198,49 @@ history.replaceState = () => {};
       for (const inner of some) found.push(...(await list(inner)));
     }
   };
-  addEventListener("dragover", (event) => {
-    if (event.dataTransfer.types.includes("Files")) event.preventDefault();
-  });
-  addEventListener("drop", async (event) => {
-    const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry()).filter(Boolean);
-    if (!entries.length) return;
-    event.preventDefault();
-    const found = (await Promise.all(entries.map(list))).flat();
-    const [first] = entries;
-    const single = entries.length === 1 && first.isFile && !image.test(first.name);
+  // both: where the page was drawn anew under the pointer, the next event enters it
+  for (const kind of ["dragenter", "dragover"])
+    addEventListener(kind, (event) => {
+      if (event.dataTransfer.types.includes("Files")) event.preventDefault();
+    });
+  let isHanding = false;
+  // files: [{path, file}] ...
+  const hand = async (name, files, target) => {
     const given = new DataTransfer();
-    given.items.add(single ? found[0].file : new File([await zip(found)], `${first.name}.zip`));
-    let target; // looked for last, and for 30 s: the page may be drawing it anew; one that only watches has none
-    for (let tries = 300; !(target = document.querySelector(input)); await new Promise((done) => setTimeout(done, 100)))
+    const single = files.length === 1 && !files[0].path.includes("/") && !image.test(name);
+    given.items.add(single ? files[0].file : new File([await zip(files)], `${name}.zip`));
+    showNotice("");
+    target ??= document.querySelector(input);
+    for (let tries = 300; !target?.isConnected; target = document.querySelector(input)) {
+      // looked for last, and for 30 s: the page may be drawing it anew; one that only watches has none
       if (!tries--) return;
+      await new Promise((done) => setTimeout(done, 100));
+    }
     target.files = given.files;
+    isHanding = true;
     target.dispatchEvent(new Event("change", { bubbles: true }));
+    isHanding = false;
+  };
+  addEventListener("drop", async (event) => {
+    const given = [...event.dataTransfer.items].map((item) => [item.webkitGetAsEntry(), item.getAsFile()]);
+    const dropped = given.filter(([entry, own]) => entry ?? own);
+    if (!dropped.length) return;
+    event.preventDefault();
+    showNotice("Listing the files …");
+    const listed = await Promise.all(dropped.map((each) => list(...each)));
+    await hand((dropped[0][0] ?? dropped[0][1]).name, listed.flat());
   });
+  // Its dialog takes several files, or a folder, as a drop does.
+  addEventListener("click", ({ target }) => {
+    if (!target.matches?.(input)) return;
+    target.multiple = true;
+    target.webkitdirectory = target.accept.endsWith(FOLDER);
+  }, true);
+  addEventListener("change", (event) => {
+    const { target } = event;
+    if (isHanding || !target.matches?.(input) || !target.files.length) return;
+    event.stopImmediatePropagation();
+    const files = [...target.files].map((file) => ({ path: file.webkitRelativePath || file.name, file }));
+    hand(files[0].path.split("/")[0], files, target);
+  }, true);
 })();

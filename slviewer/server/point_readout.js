@@ -88,6 +88,9 @@
         [mark.style.left, mark.style.top] = project(found.world, target).map(px => `${px}px`);
         const [x, y, z] = found.mm.map(mm => mm.toFixed(2));
         text.textContent = `x ${x}, y ${y}, z ${z} mm`;
+        text.style.translate = "";
+        const over = text.getBoundingClientRect().right - target.getBoundingClientRect().right;
+        if (over > 0) text.style.translate = `${-over}px`; // not over the panel beside the view
       }
       moved = undefined;
     }
@@ -124,6 +127,10 @@
         if (dragged?.isMoved) release(event);
         dragged = undefined;
         move(event);
+        return false;
+      },
+      pointerout({ relatedTarget }) {
+        if (!relatedTarget && !dragged) mark.hidden = true; // the pointer left the page
         return false;
       },
       pointercancel({ isTrusted }) {

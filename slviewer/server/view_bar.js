@@ -139,7 +139,7 @@
       style.setProperty("--bar-right", `${innerWidth - box.right + 10}px`);
       style.setProperty("--bar-bottom", `${innerHeight - box.bottom + 10}px`);
       Object.assign(bar.style, { right: "var(--bar-right)", bottom: "var(--bar-bottom)" });
-      Object.assign(scale.style, { left: `${box.left + 14}px`, bottom: `${innerHeight - box.bottom + 14}px` });
+      Object.assign(scale.style, { left: `${box.left + 14}px`, bottom: `${innerHeight - box.bottom + (box.width < 520 ? 52 : 14)}px` });
       const mmPerPx = (2 * distance * Math.tan((camera.fov * Math.PI) / 360)) / box.height;
       const decade = 10 ** Math.floor(Math.log10(SCALE_PX * mmPerPx));
       const mm = decade * [5, 2, 1].find(n => n * decade <= SCALE_PX * mmPerPx);

@@ -42,6 +42,7 @@ CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
 PAGE_SCRIPT = b"\n".join(
     resources.files("slviewer.server").joinpath(name).read_bytes()
     for name in (
+        "missing_features.js",
         "page_script.js",
         "control_script.js",
         "pointer_script.js",

@@ -96,7 +96,7 @@ def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def arriving_path(path: Path, needs_bytes: int = 0) -> Iterator[Path]:
+def arriving_path(path: Path, needs_bytes: int) -> Iterator[Path]:
     """As `arriving_file`, of a file that does not exist yet, for a library that creates it
     itself."""
     with _arriving(path, needs_bytes) as temporary:

@@ -20,7 +20,7 @@ from slviewer.errors import SessionError
 from slviewer.session.reading import limit_process, run_isolated
 
 PACKAGES = {"step": ("cascadio",), "stp": ("cascadio",), "3mf": ("lxml", "networkx")}
-"""What reading or writing a format needs."""
+"""What reading a format needs."""
 INSTALL_COMMAND = "pip install 'slviewer[cad]'"
 CHORD_MM = 0.005
 """Largest distance of the triangles from the surfaces of a STEP model."""
@@ -43,7 +43,7 @@ not to explode."""
 
 
 def require_packages(file_format: str) -> None:
-    """Raise SessionError where a package that reads or writes the format is missing."""
+    """Raise SessionError where a package that reads the format is missing."""
     missing = [package for package in PACKAGES[file_format] if find_spec(package) is None]
     if missing:
         raise SessionError(

@@ -53,6 +53,7 @@ _Decisions = TypedDict(
         "align_scans": bool | None,
         "region": _Region | None,
         "report": ReportDetails | None,
+        "running": str | None,  # what the wizard computes; stays where the program is ended
     },
     total=False,
 )

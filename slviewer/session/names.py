@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from slviewer.errors import InputError
 
 _SAFE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}")
+_LONGEST = 200
+"""Bytes of a folder's name: file systems take 255, and a temporary one beside it needs some."""
 _DEVICE = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 """Names that Windows keeps for devices, with any suffix."""
 
@@ -77,6 +79,24 @@ def clean_label(text: str) -> str:
             f"{label!r} holds characters that cannot be printed", "type the name again"
         )
     return label
+
+
+def folder_name(text: str) -> str:
+    """Return an operator's name for a session as that of its folder, on every system: printable
+    characters, without space at its ends. Raises InputError for what would be a path or has another
+    meaning."""
+    name = clean_label(text)
+    if found := sorted({*name} & {*r'/\:*?"<>|'}):
+        raise InputError(f"{name!r} cannot be a name with {' '.join(found)} in it", "use - or _")
+    if _DEVICE.fullmatch(name) or name.startswith(".") or name.endswith("."):
+        raise InputError(
+            f"{name!r} cannot be a name: it begins or ends with a dot, or Windows keeps it for a"
+            " device",
+            "choose another one",
+        )
+    if len(name.encode()) > _LONGEST:
+        raise InputError(f"{name[:20]!r} ... is too long a name", f"use {_LONGEST // 2} letters")
+    return name
 
 
 def join_names(names: Sequence[str], most: int = 6) -> str:

@@ -1,8 +1,8 @@
 """A nominal model from a file: checked, cleaned, and in millimetres."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -11,17 +11,17 @@ from scipy.sparse.csgraph import connected_components
 from slviewer.errors import InputError, SessionError
 from slviewer.geometry.vectors import diagonal, lengths, thin_out
 from slviewer.session import cad
+from slviewer.session.columns import Columns
 from slviewer.session.polygons import Polygons, read_polygons, to_polygons, triangulate_polygons
 from slviewer.session.reading import expand_user, read_input
 from slviewer.session.results import digest_bytes
+from slviewer.session.units import MM, Units, find_origin, read_units
 from slviewer.surface.shapes import Mesh, list_adjacent_faces
 
-Units = Literal["mm", "cm", "m", "inch"]
 NOMINALS = "nominal"
 """Folder of a session with the nominal models that were uploaded."""
-FORMATS = (".stl", ".ply", ".obj", ".step", ".stp", ".3mf")
+FORMATS = (".stl", ".ply", ".obj", ".off", ".step", ".stp", ".3mf")
 MAX_BYTES = 1 << 28
-MM: dict[Units, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 MAX_SIZE_RATIO = 5.0
 """A scan's size over the nominal's, or its inverse, from which on the units must be given."""
 MATCHING_SIZE_RATIO = 2.0
@@ -37,7 +37,8 @@ MAX_DEGENERATE_SHARE = 0.5
 class Nominal:
     """A nominal model: its ``mesh`` in mm, the file's ``name`` and content ``hash``, the ``units``
     that it was read in (None: none were given, and mm assumed), whether it is ``closed``, and
-    ``notes``, one for each repair.
+    ``notes``, one for each repair. ``columns``: the numbers of the file's vertices by name, in its
+    units; empty where there are none but places. ``origin_mm`` (3,): subtracted from the vertices.
     """
 
     mesh: Mesh
@@ -46,6 +47,8 @@ class Nominal:
     units: Units | None
     closed: bool
     notes: tuple[str, ...] = ()
+    columns: Columns = field(default_factory=dict)
+    origin_mm: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def size_mm(self) -> np.ndarray:
@@ -60,8 +63,8 @@ class Nominal:
 
 
 def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
-    """The model in an STL, PLY or OBJ file, whose numbers are in ``units``, or where none are given
-    in mm; or in a STEP or 3MF file, which states its units.
+    """The model in an STL, PLY, OBJ or OFF file, whose numbers are in ``units``, or where none are
+    given in those that it states, or mm; or in a STEP or 3MF file, which states its units.
 
     Raises SessionError for a file that cannot be used, with the reason: one that is absent, too
     large, damaged, truncated, of another format, without triangles, or with too many.
@@ -70,7 +73,7 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     if path.suffix.lower() not in FORMATS:
         raise SessionError(
             f"{path.name} is not a nominal model that can be read",
-            "give an STL, PLY, OBJ, STEP or 3MF file",
+            "give an STL, PLY, OBJ, OFF, STEP or 3MF file",
         )
     remedy = f"give a file of up to {MAX_BYTES >> 20} MiB"
     data = read_input(path, MAX_BYTES, remedy, SessionError)
@@ -80,12 +83,14 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
         polygons = to_polygons(vertices, faces)
         units = "mm"
     else:
+        units = read_units(path.name, data, units, notes)
         polygons = read_polygons(path.name, data, notes)
-    polygons = _merge_vertices(path.name, polygons, MM[units or "mm"])
+    columns = polygons.columns
+    polygons, origin = _merge_vertices(path.name, polygons, MM[units or "mm"], notes)
     faces = triangulate_polygons(polygons, notes)
     mesh, closed = _repair(path.name, polygons.vertices, faces, notes)
     digest = digest_bytes(data).hex()
-    return Nominal(mesh, path.name, digest, units, closed, tuple(notes))
+    return Nominal(mesh, path.name, digest, units, closed, tuple(notes), columns, origin)
 
 
 def check_size(nominal: Nominal, points: np.ndarray) -> None:
@@ -127,9 +132,12 @@ def _format_size(size: float) -> str:
     return f"{size:,.0f}" if size >= 100 else f"{size:#.3g}"
 
 
-def _merge_vertices(name: str, polygons: Polygons, scale: float) -> Polygons:
-    """Return polygons in mm without duplicate vertices. Raises SessionError where there are none,
-    and for vertices that are missing, not numbers, or beyond what is read."""
+def _merge_vertices(
+    name: str, polygons: Polygons, scale: float, notes: list[str]
+) -> tuple[Polygons, np.ndarray]:
+    """Return polygons in mm without duplicate vertices, and the origin (3,) that was subtracted as
+    they are far from it. Raises SessionError where there are none, and for vertices that are
+    missing, not numbers, or beyond what is read."""
     from trimesh.grouping import unique_rows
 
     vertices, corners, counts = polygons.vertices, polygons.corners, polygons.counts
@@ -146,14 +154,16 @@ def _merge_vertices(name: str, polygons: Polygons, scale: float) -> Polygons:
             f"{name} holds points that are not numbers (NaN or infinite)", "export the model again"
         )
     vertices = scale * vertices
-    if not (reach := np.abs(vertices).max()) < MAX_COORDINATE_MM:
+    if any(origin := find_origin(vertices) or (0.0, 0.0, 0.0)):
+        notes.append("less the origin {:.10g} {:.10g} {:.10g} mm".format(*origin))
+        vertices = vertices - origin
+    if not (size := np.ptp(vertices, axis=0).max()) < MAX_COORDINATE_MM:
         raise SessionError(
-            f"{name} reaches {reach:.3g} mm",
-            f"models up to {MAX_COORDINATE_MM:g} mm are read; give its units, or move it to its"
-            " origin",
+            f"{name} measures {size:.3g} mm across",
+            f"models up to {MAX_COORDINATE_MM:g} mm are read; give its units",
         )
     first, same = unique_rows(vertices, digits=MERGED_DECIMALS)
-    return Polygons(vertices[first], same[corners], counts)
+    return Polygons(vertices[first], same[corners], counts), np.array(origin)
 
 
 def _repair(

@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from struct import Struct
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from slviewer.session.atomic import arriving_file
 from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_input
 
 PLACE, NORMAL, COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
-_WRITTEN_TYPES = {"<f4": "float", "u1": "uchar"}
+_WRITTEN_TYPES = {"<f4": "float", "<f8": "double", "u1": "uchar"}
 _TYPES = {
     name: code
     for names, code in {
@@ -33,11 +34,15 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 NO_INDICES = np.empty(0, np.int64)
 PlyProperty = tuple[str, str, str]
 """Name and type of a property, and for a list the type of its length."""
+PlyElements = dict[str, tuple[int, list[PlyProperty]]]
+"""Of each element the number and the properties."""
 PlyRows = dict[str, tuple[np.ndarray, np.ndarray]]
 """Of each property the values (k,) of all elements, and their number (n,) in each element."""
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
 CHUNK = 1 << 15
 """Points that are packed at a time, in the processor's cache."""
+FAR_MM = 4096.0
+"""From the origin: from here on float32 rounds by up to 0.24 um, and coordinates get an origin."""
 UNKNOWN_SIGMA = -1.0
 """Value of an unknown standard deviation: no NaN is written, and 0 would claim too much."""
 
@@ -68,10 +73,11 @@ def write_ply(
     at all.
 
     ``colours``: (n,) grey or (n, 3) RGB, uint8. ``normals``: (n, 3); one that is not known (NaN) is
-    written as 0 0 0. ``scalars``: named (n,), as float32 properties of the vertices; a sigma that
-    is not known is written as -1. ``faces``: (m, 3) indices into the points. ``notes``: sentences
-    for the file's comments, besides those that state the program and the units. Raises InputError
-    for shapes that do not fit together and for NaN elsewhere; SessionError where the file cannot be
+    written as 0 0 0. ``scalars``: named (n,), as properties of the vertices; a sigma that is not
+    known is written as -1. ``faces``: (m, 3) indices into the points. ``notes``: sentences for the
+    file's comments, besides those that state the program and the units. Numbers are float32, of
+    scalars in float64, and of points beyond `FAR_MM` in float64, double. Raises InputError for
+    shapes that do not fit together and for NaN points; SessionError where the file cannot be
     written (an older file of that name stays unchanged).
     """
     points = np.asarray(points)
@@ -153,7 +159,7 @@ def read_ply(path: str | Path) -> Ply:
     return Ply(points, colours, normals, vertices, corners.reshape(-1, 3))
 
 
-def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, list[PlyProperty]]], int]:
+def parse_ply_header(data: bytes) -> tuple[str, PlyElements, int]:
     """Return the byte order of a PLY ("": it is text), of each element the number and the
     properties, and where its body begins. Raises ValueError or LookupError for other content."""
     end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data[:65536])
@@ -168,8 +174,10 @@ def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, list[PlyPro
             properties = []
             elements[words[1]] = int(words[2]), properties
         elif words[:1] == ["property"]:
-            kinds = [_TYPES[word] for word in words[1:-1] if word != "list"]
-            codes = [order + kind if order else "<f8" for kind in kinds]
+            kinds = [word for word in words[1:-1] if word != "list"]
+            if unknown := [kind for kind in kinds if kind not in _TYPES]:
+                raise ValueError(f"its property {words[-1]} is of the unknown type {unknown[0]}")
+            codes = [order + _TYPES[kind] for kind in kinds]
             properties.append((words[-1], codes[-1], codes[0] if len(codes) > 1 else ""))
     return order, elements, end.end()
 
@@ -203,20 +211,28 @@ def _walk_ply_rows(
     body: bytes, position: int, count: int, properties: list[PlyProperty]
 ) -> tuple[PlyRows, int]:
     """Return what `read_ply_rows` does, element by element, whose lists may differ in length."""
-    values: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in properties}
+    values: dict[str, list[bytes]] = {name: [] for name, _, _ in properties}
+    steps = [
+        (values[name], np.dtype(code).itemsize, length and Struct(code[0] + np.dtype(length).char))
+        for name, code, length in properties
+    ]
     for _ in range(count):
-        for name, code, length in properties:
-            number = 1
+        for parts, size, length in steps:
             if length:
-                number = int(np.frombuffer(body, length, 1, position)[0])
-                position += np.dtype(length).itemsize
-            if not 0 <= number <= len(body):
-                raise ValueError(f"a list of {number}")
-            values[name].append(np.frombuffer(body, code, number, position))
-            position += values[name][-1].nbytes
+                if position + length.size > len(body):
+                    raise ValueError("it ends early")
+                size *= int(length.unpack_from(body, position)[0])
+                position += length.size
+            if not 0 <= size <= len(body) - position:
+                raise ValueError(f"a list of {size} bytes")
+            parts.append(body[position : position + size])
+            position += size
     return {
-        name: (np.concatenate(parts), np.array([len(part) for part in parts]))
-        for name, parts in values.items()
+        name: (
+            np.frombuffer(bytearray().join(values[name]), code),
+            np.array([len(part) for part in values[name]]) // np.dtype(code).itemsize,
+        )
+        for name, code, _ in properties
     }, position
 
 
@@ -228,6 +244,8 @@ def to_ascii(note: str) -> str:
 def replace_nan(name: str, values: np.ndarray) -> np.ndarray:
     """Replace unknown values of a vertex property by their code in the file: see ``write_ply``."""
     if values.dtype.kind != "f" or name in PLACE:
+        return values
+    if name not in NORMAL and not name.startswith("sigma"):
         return values
     return np.where(np.isfinite(values), values, 0.0 if name in NORMAL else UNKNOWN_SIGMA)
 
@@ -264,9 +282,10 @@ def _vertex_fields(
     given: list[tuple[str, tuple[str, ...], str, np.ndarray | None]] = [
         ("normals", NORMAL, "<f4", normals),
         ("colours", COLOURS, "u1", colours),
-        *((name, (name,), "<f4", np.asarray(values)) for name, values in scalars.items()),
+        *((name, (name,), _to_type(each), np.asarray(each)) for name, each in scalars.items()),
     ]
-    fields: list[tuple[tuple[str, ...], str, np.ndarray]] = [(PLACE, "<f4", points)]
+    place_type = _to_type(points, FAR_MM)
+    fields: list[tuple[tuple[str, ...], str, np.ndarray]] = [(PLACE, place_type, points)]
     for what, names, code, values in given:
         if values is None:
             continue
@@ -279,21 +298,24 @@ def _vertex_fields(
         if code == "u1" and values.dtype != np.uint8:
             raise InputError(f"Colours of {values.dtype} were given", "they must be uint8.")
         if len(names) == 1:
-            _check_scalar(what, values, [name for before, _, _ in fields for name in before])
+            _check_name(what, [name for before, _, _ in fields for name in before])
         elif values.ndim == 1:
             values = np.repeat(values, len(names)).reshape(shape)
         fields.append((names, code, values))
     return fields
 
 
-def _check_scalar(name: str, values: np.ndarray, others: Sequence[str]) -> None:
-    """Raise InputError for a name that no PLY property can have besides others, and for unknown
-    values other than a sigma's."""
+def _to_type(values: np.ndarray, beyond: float = 0.0) -> str:
+    """Return the type in which the values of a property are written, float32 where all are within
+    ``beyond``."""
+    is_wide = np.asarray(values).dtype == np.float64
+    return "<f8" if is_wide and not np.abs(values).max(initial=0) <= beyond else "<f4"
+
+
+def _check_name(name: str, others: Sequence[str]) -> None:
+    """Raise InputError for a name that no PLY property can have besides others."""
     if not (name.isascii() and name.isidentifier()) or name in others:
         raise InputError(
             f"A scalar named {name!r} cannot be a PLY property",
             "use letters, digits, _, and a new name.",
         )
-    unknown = np.count_nonzero(~np.isfinite(values))
-    if unknown and not name.startswith("sigma"):
-        raise InputError(f"{name} is not known of {unknown} points", "leave them out.")

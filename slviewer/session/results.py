@@ -21,7 +21,7 @@ import numpy as np
 from slviewer.errors import DamagedError, InputError
 from slviewer.records.kinds import all_kinds
 from slviewer.records.record import Count, Vector, from_plain
-from slviewer.records.verdict import Examination
+from slviewer.records.verdict import Examination, Verdict
 from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.layout import inner_folders
 from slviewer.session.names import safe_path
@@ -88,14 +88,27 @@ class _Stereo(ResultMeta, total=False):
 class _Verdict(ResultMeta, total=False):
     """`verdict/1`, on the last attempt to calibrate."""
 
-    verdict: dict[str, Any]
+    verdict: Verdict
+
+
+_Finite = Annotated[float, msgspec.Meta(gt=-1e9, lt=1e9)]
+
+
+class _CompiledAxis(TypedDict):
+    """The numbers of a compiled axis."""
+
+    axis: Literal["x", "y"]
+    centre: _Finite
+    step: Extent
+    near: _Finite
+    far: _Finite
 
 
 class _Compiled(ResultMeta, total=False):
     """`compiled/splined`."""
 
     version: int
-    compiled: dict[str, Any]
+    compiled: _CompiledAxis
 
 
 class _Projector(ResultMeta, total=False):
@@ -290,12 +303,13 @@ def _read_meta(folder: Path, identity: object) -> dict[str, Any]:
 def verify_result(folder: Path) -> None:
     """Read a whole result; raises DamagedError unless it is what was saved."""
     meta = read_meta(folder)
-    names = meta.get("arrays", [])
+    digests, checksums = {}, meta.get("checksums", {})
     try:
-        digests = {
-            name: digest_bytes(read_file(_array_path(folder, name), MAX_ARRAY_BYTES))
-            for name in names
-        }
+        for name in meta.get("arrays", []):
+            data = read_file(_array_path(folder, name), MAX_ARRAY_BYTES)
+            digests[name] = digest_bytes(data)
+            if checksums.get(name, checksum := google_crc32c.value(data)) != checksum:
+                raise _damage(folder, f"array {name}: its checksum differs from the saved one")
     except OSError as error:
         raise _damage(folder, str(error)) from error
     if _combine_digests(
@@ -305,7 +319,7 @@ def verify_result(folder: Path) -> None:
 
 
 def read_arrays(
-    folder: Path, meta: Mapping[str, Any], only: Collection[str] | None = None
+    folder: Path, meta: Mapping[str, Any], only: Collection[str] | None
 ) -> dict[str, np.ndarray]:
     """The arrays of a result with that meta (those named in `only`); DamagedError where one is
     missing or not what was saved."""

@@ -5,24 +5,24 @@ Each format is a module of `session.formats`; plugins add others, an `Exporter` 
 whole or not at all.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
-from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 from typing import Any
 
 import numpy as np
 
-from slviewer.entry_points import PluginGroup
+from slviewer.entry_points import PluginGroup, import_modules
 from slviewer.errors import InputError
 from slviewer.session import formats
 from slviewer.session.atomic import replace_file
+from slviewer.session.columns import Columns
 from slviewer.session.formats.glb import encode_glb
 from slviewer.session.formats.obj import write_textured_obj
+from slviewer.session.names import join_names
 from slviewer.session.ply import check_faces
-from slviewer.session.shape_format import Columns, Shape, ShapeFormat, split_shape
+from slviewer.session.shape_format import Shape, ShapeFormat, split_shape
 from slviewer.surface.shapes import Mesh, PointSet
 
 
@@ -45,8 +45,7 @@ class Exporter:
 @cache
 def own_formats() -> dict[str, ShapeFormat]:
     """Return slviewer's formats by name, PLY first."""
-    names = [each.name for each in iter_modules(formats.__path__)]
-    found = [import_module(f"{formats.__name__}.{name}").FORMAT for name in names]
+    found = [module.FORMAT for module in import_modules(formats)]
     return {each.name: each for each in sorted(found, key=lambda f: (f.name != "ply", f.name))}
 
 
@@ -73,6 +72,8 @@ def _adapt(added: Exporter) -> ShapeFormat:
         write=write,
         takes_points=added.takes_points,
         takes_meshes=added.takes_meshes,
+        holds_scalars=True,
+        holds_origin=False,
     )
 
 
@@ -97,7 +98,7 @@ def write_shape(
 
     ``scalars``: values (n,) of each point by name, such as ``sigma_noise`` mm or ``deviation`` mm,
     for the formats that hold them (PLY, PCD); the shape's own ``sigma_mm`` is called ``sigma``.
-    ``notes``: sentences for the comments.
+    ``notes``: sentences for the comments. `describe_loss` says what a format does not hold.
 
     Raises InputError for another suffix, for points where a format takes only triangles, for NaN
     points and for an empty shape; SessionError where the disk refuses (a file of that name stays
@@ -116,8 +117,24 @@ def write_shape(
     if faces is not None:
         check_faces(faces, len(points))
     assert chosen.write is not None
+    if loss := describe_loss(path, shape):
+        shape, notes = replace(shape, origin=None), [*notes, loss]
     chosen.write(path, shape, values, notes)
     return path.stat().st_size
+
+
+def describe_loss(path: str | Path, shape: PointSet | Mesh, scalars: Collection[str] = ()) -> str:
+    """Describe which of a shape's origin and scalars the format of a suffix does not hold; empty
+    where it holds all."""
+    chosen = all_formats()[Path(path).suffix.lower().removeprefix(".")]
+    lost = list[str]()
+    if scalars and not chosen.holds_scalars:
+        holding = ", ".join(f".{n}" for n, each in all_formats().items() if each.holds_scalars)
+        lost.append(f"without {join_names(sorted(scalars), 30)}, which {holding} hold")
+    if shape.origin is not None and not chosen.holds_origin:
+        x, y, z = shape.origin
+        lost.append(f"coordinates less the origin {x:.10g} {y:.10g} {z:.10g} mm")
+    return "; ".join(lost)
 
 
 def _find_format(path: Path, is_mesh: bool) -> ShapeFormat:

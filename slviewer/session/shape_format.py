@@ -1,6 +1,6 @@
 """What a file format of points and meshes is: each is declared in a module of `session.formats`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 
 from slviewer.session.atomic import replace_file
-from slviewer.session.nominal import Units
+from slviewer.session.columns import Columns
 from slviewer.session.ply import replace_nan
+from slviewer.session.units import Units
 from slviewer.surface.shapes import Mesh, PointSet
 
 Shape = PointSet | Mesh
-Columns = Mapping[str, np.ndarray]
-"""Values (n,) of each point by name, in the order of the points: x y z, nx ny nz, red green blue
-(uint8) and sigma; ``sensor`` (3,) is the place of a scanner."""
 Write = Callable[[Path, Shape, Columns, Sequence[str]], None]
-Read = Callable[[Path, bytes], list[Columns]]
+Read = Callable[[Path, bytes, list[str]], list[Columns]]
 DECIMALS = 6
 """Of lengths in text: a nanometre, below what a float32 of some hundred mm resolves."""
 
@@ -47,9 +45,12 @@ class ShapeFormat:
 
     ``name``: the suffix in lower case, without the dot, under which it is written, ``others`` under
     which it is read too. ``what``: unit and content, in a few words. ``write(path, shape, scalars,
-    notes)`` writes a shape in mm; scalars and notes as in `write_shape`. ``read(path, data)``: the
-    clouds of a file, in its ``unit``; None where its points are read as those of a nominal model,
-    or not at all. Both raise InputError with what to do.
+    notes)`` writes a shape in mm; scalars and notes as in `write_shape`.
+    ``read(path, data, notes)``: the columns of the clouds of a file, in its ``unit``, by their
+    names in it; what it holds besides is named in ``notes``. None where its points are read as
+    those of a nominal model, or not at all. Both raise InputError with what to do.
+    ``holds_scalars``: values of each point by name; ``holds_origin``: coordinates far from the
+    origin, in more than float32.
     """
 
     name: str
@@ -61,6 +62,8 @@ class ShapeFormat:
     read: Read | None = None
     others: tuple[str, ...] = ()
     unit: Units = "mm"
+    holds_scalars: bool = False
+    holds_origin: bool = True
 
     @property
     def suffixes(self) -> tuple[str, ...]:
@@ -69,10 +72,12 @@ class ShapeFormat:
 
 
 def split_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points (n, 3) mm of a shape, and the triangles (m, 3) of a mesh."""
-    if isinstance(shape, Mesh):
-        return shape.vertices, shape.faces
-    return shape.points, None
+    """Return the points (n, 3) mm of a shape, float64 where it has an origin, which is added, and
+    the triangles (m, 3) of a mesh."""
+    points, faces = (
+        (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
+    )
+    return points if shape.origin is None else points + shape.origin, faces
 
 
 def writing(encode: Callable[[Any, Sequence[str]], bytes]) -> Write:
@@ -89,12 +94,14 @@ def to_trimesh(shape: Shape, scale: float = 1.0) -> Any:
     """A trimesh.Trimesh or PointCloud with colours and normals, which are zero where unknown."""
     import trimesh
 
-    if isinstance(shape, PointSet):
-        return trimesh.PointCloud(scale * shape.points.astype(np.float64), shape.colours)
+    points, faces = split_shape(shape)
+    points = scale * points.astype(np.float64)
+    if faces is None:
+        return trimesh.PointCloud(points, shape.colours)
     normals = None if shape.normals is None else replace_nan("nx", shape.normals)
     return trimesh.Trimesh(
-        scale * shape.vertices.astype(np.float64),
-        shape.faces,
+        points,
+        faces,
         vertex_normals=normals,
         vertex_colors=shape.colours,
         process=False,

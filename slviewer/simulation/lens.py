@@ -107,10 +107,8 @@ def _project_point(x, y, numbers, waves):
         sine, cosine = math.sin(angle), math.cos(angle)
         wu += waves[i, 2] * sine + waves[i, 3] * cosine
         wv += waves[i, 4] * sine + waves[i, 5] * cosine
-        au, av = (
-            waves[i, 2] * cosine - waves[i, 3] * sine,
-            waves[i, 4] * cosine - waves[i, 5] * sine,
-        )
+        au = waves[i, 2] * cosine - waves[i, 3] * sine
+        av = waves[i, 4] * cosine - waves[i, 5] * sine
         wuu += au * waves[i, 0]
         wuv += au * waves[i, 1]
         wvu += av * waves[i, 0]

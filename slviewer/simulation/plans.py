@@ -57,10 +57,8 @@ def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
     that.
     """
     smooth = np.zeros((0, 6))  # what is in view is not a matter of tenths of a pixel
-    camera, projector = (
-        replace(rig.camera, scale=1.0, waves=smooth),
-        replace(rig.projector, waves=smooth),
-    )
+    camera = replace(rig.camera, scale=1.0, waves=smooth)
+    projector = replace(rig.projector, waves=smooth)
     rig = replace(rig, camera=camera, projector=projector)
     rng = np.random.default_rng([rig.seed, 0x705E])
     middle = box_middle(board.points)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from scipy.ndimage import correlate1d
 from scipy.sparse import csr_matrix
@@ -112,7 +113,7 @@ class Renderer:
         gain: float = 1.0,
     ) -> None:
         """Fill `out` (h, w) uint8 with one frame of `pattern`, the axis and grey levels that
-        `fringe.patterns.profile` gives.
+        `fringe.patterns.profile` gives, or no axis and an image (h, w, 3) uint8.
 
         `keys` (2,) uint32 decide the noise, `lamp` is the relative light of this frame, `exposure`
         replaces the renderer's own, and `gain` multiplies the signal and its noise before they
@@ -139,6 +140,10 @@ class Renderer:
         rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
         exposure = self.exposure if exposure is None else exposure
         illuminated, stray = self._light(exposure)
+        if grey_levels.ndim == 3:
+            return (
+                self._blur(illuminated * np.float32(lamp) * self._image_light(grey_levels)) + stray
+            )
         # Rows and columns are blurred alike in space, hence by different numbers of pixels.
         sigmas = maps.sigmas * (rig.rows_per_column if varies == "y" else 1.0)
         light_levels = (grey_levels / 255.0) ** rig.light.gamma
@@ -153,6 +158,16 @@ class Renderer:
             indirect = self._indirect_light(varies or "x", (1 - rig.light.black) * light_levels)
             out += np.float32(lamp * exposure) * indirect
         return out
+
+    def _image_light(self, image: np.ndarray) -> Map:
+        """Light on the maps, 0 ... 1, of an image (h, w, 3) of the projector as a camera without
+        colours sees it: with the same blur everywhere, and without interreflections."""
+        maps, light = self._maps, self.rig.light
+        blur = float(np.interp(np.median(maps.level), np.arange(len(maps.sigmas)), maps.sigmas))
+        sharp = ((image / 255.0) ** light.gamma).mean(axis=2).astype(np.float32)
+        blurred = cv2.GaussianBlur(sharp, (0, 0), blur, sigmaY=blur * self.rig.rows_per_column)
+        u, v = (maps.coordinates[axis] for axis in AXES)
+        return cv2.remap(blurred, u, v, cv2.INTER_LINEAR)
 
     def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> Map:
         """Light at unit exposure, (h, w) float32, that the surface throws on itself under a profile

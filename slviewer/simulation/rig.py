@@ -80,6 +80,11 @@ def check_scale(scale: float) -> None:
         )
 
 
+def read_preset() -> dict[str, Any]:
+    """Return what is known of the Letter's rig."""
+    return tomllib.loads(asset("simulation/letter.toml").read_text(encoding="utf-8"))
+
+
 def letter(
     scale: float = 1.0,
     seed: int = 0,
@@ -104,7 +109,7 @@ def letter(
         )
     if texture not in ("coarse", "fine"):
         raise InputError(f"the local distortion's texture is coarse or fine, not {texture!r}")
-    preset = tomllib.loads(asset("simulation/letter.toml").read_text(encoding="utf-8"))
+    preset = read_preset()
     streams = np.random.SeedSequence([seed, 0x51]).spawn(3)
     camera, projector = (
         sample_device(stream, preset, name, texture, local_distortion_px)

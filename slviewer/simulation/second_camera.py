@@ -1,17 +1,15 @@
 """A second camera beside the simulated rig: its lens, its place, and the scene as it sees it."""
 
-import tomllib
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import BoardScene, Pose
 from slviewer.simulation.decals import MarkedScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.renderer import Renderer
-from slviewer.simulation.rig import SimulatedRig, sample_arrangement, sample_device
+from slviewer.simulation.rig import SimulatedRig, read_preset, sample_arrangement, sample_device
 from slviewer.simulation.scenes import Scene, Spheres
 
 
@@ -43,7 +41,7 @@ class SecondCamera:
 def second_camera(rig: SimulatedRig) -> SecondCamera:
     """Return the second camera of a rig of `letter`, on the other side of its projector; its own
     lens, drawn by the rig's seed, and its own noise."""
-    preset = tomllib.loads(asset("simulation/letter.toml").read_text(encoding="utf-8"))
+    preset = read_preset()
     lens, place = np.random.SeedSequence([rig.seed, 0x52]).spawn(2)
     camera = replace(sample_device(lens, preset, "camera"), scale=rig.camera.scale)
     R, t = sample_arrangement(place, preset, "second_arrangement")

@@ -41,6 +41,8 @@ SMALL_HOLE = 5.0
 SMALL_PART = 1000.0
 """Points, about: larger parts stay, for before a wall an object is a small share of what was
 scanned."""
+TRIANGLES_PER_POINT = 2
+"""Of a closed triangulation of points (Euler's formula); a mesh with more does not show more."""
 MOST_IMAGINED = 1 / 3
 """Share of a watertight surface that may be filled in where nothing was measured: the foot of what
 stood on a table."""
@@ -56,7 +58,8 @@ class MeshingPlan:
             for merged ones.
         fill_holes_mm: Of a mesh: fill holes of up to so many mm across; by default a few spacings
             of the points.
-        triangles: Of a mesh: thin it to so many triangles.
+        triangles: Of a mesh: thin it to so many triangles; by default to two for each point, about
+            what a surface through them has.
         smooth: Of a mesh: rounds of smoothing, 0 for none; how far it moved the surface is
             reported.
         watertight: Of a mesh: close the surface, or report why it cannot be closed. A gap that no
@@ -174,7 +177,7 @@ def build_mesh(
     cell = measure_spacing(points)
     limit = plan.largest_hole_mm(method, cell)
     report(0.1, f"meshing by {method}")
-    trimmed = filled = smoothed = thinned = None
+    trimmed = filled = smoothed = None
     if method == "grid":
         mesh = grid_mesh(shape)
     elif points.normals is None:
@@ -200,15 +203,26 @@ def build_mesh(
     if plan.smooth:
         report(0.7, "smoothing")
         mesh, smoothed = smooth(mesh, plan.smooth)
-    if plan.triangles is not None:
-        report(0.8, f"thinning to {plan.triangles} triangles")
-        mesh, thinned = decimate(mesh, plan.triangles)
+    report(0.8, "thinning")
+    mesh, thinned = _thin(mesh, plan, len(points))
     report(0.95, "checking")
     topology = analyse_topology(mesh)
     if plan.watertight:
         _refuse_if_open(topology, trimmed, method)
     report(1.0, "meshed")
     return BuiltMesh(mesh, method, cell, dropped, trimmed, filled, smoothed, thinned, topology)
+
+
+def _thin(mesh: Mesh, plan: MeshingPlan, points: int) -> tuple[Mesh, SurfaceShift | None]:
+    """Thin a mesh through a number of points to the plan's number of triangles, by default that of
+    the points; None where it has no more."""
+    most = plan.triangles or TRIANGLES_PER_POINT * points
+    if len(mesh.faces) <= most:
+        return mesh, None
+    thinned, shift = decimate(mesh, most)
+    if plan.triangles is None and plan.watertight and not analyse_topology(thinned).watertight:
+        return mesh, None  # it was closed, perhaps
+    return thinned, shift
 
 
 def _has_grid(shape: Cloud | PointSet) -> TypeGuard[Cloud]:

@@ -100,12 +100,10 @@ def interpolate_surface(p, n, reach, gate, grid, mean):
         return False
     t /= total
     curvature = max(tt / total - t * t - 2.0 * noises / total, 0.0)
-    mean[0], mean[1], mean[2], mean[3] = (
-        t,
-        squares / (total * total) + curvature,
-        s / total,
-        w / total,
-    )
+    mean[0] = t
+    mean[1] = squares / (total * total) + curvature
+    mean[2] = s / total
+    mean[3] = w / total
     length = np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
     mean[4], mean[5], mean[6] = m0 / length, m1 / length, m2 / length
     mean[7] = row * width + column

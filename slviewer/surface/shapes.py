@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats, move_points
 from slviewer.geometry.vectors import lengths, unit_vectors
 from slviewer.registration.open3d_loader import open3d
 
@@ -18,6 +19,7 @@ _DTYPES: dict[str, type] = {
     "normals": np.float32,
     "colours": np.uint8,
     "sigma_mm": np.float32,
+    "origin": np.float64,
 }
 _DIRECTIONS = unit_vectors(np.array([d for d in product((-1, 0, 1), repeat=3) if d > (0, 0, 0)]))
 """(13, 3): the sides, edges and corners of a cube, one of opposite ones."""
@@ -29,13 +31,14 @@ class PointSet:
 
     ``points`` (n, 3) float32 mm, finite. Where known: ``normals`` (n, 3) float32, of unit length,
     outwards; ``colours`` (n, 3) uint8 RGB; ``sigma_mm`` (n,) float32, the expected error of each
-    point along its normal.
+    point along its normal. ``origin`` (3,) float64 mm: where the points count from.
     """
 
     points: np.ndarray
     normals: np.ndarray | None = None
     colours: np.ndarray | None = None
     sigma_mm: np.ndarray | None = None
+    origin: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _convert_arrays(self, len(self.points))
@@ -50,7 +53,7 @@ class Mesh:
 
     ``vertices`` (n, 3) float32 mm; ``faces`` (m, 3) int32, counter-clockwise seen from outside. Of
     each vertex where known: ``normals`` (n, 3) float32, ``colours`` (n, 3) uint8 RGB, ``sigma_mm``
-    (n,) float32.
+    (n,) float32. ``origin`` (3,) float64 mm: where the vertices count from.
     """
 
     vertices: np.ndarray
@@ -58,6 +61,7 @@ class Mesh:
     normals: np.ndarray | None = None
     colours: np.ndarray | None = None
     sigma_mm: np.ndarray | None = None
+    origin: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _convert_arrays(self, len(self.vertices))
@@ -83,7 +87,7 @@ def _convert_arrays(shape: PointSet | Mesh, n: int) -> None:
         if value is not None:
             array: np.ndarray = np.asarray(value, dtype=_DTYPES[name])
             rows = len(array) if name == "faces" else n
-            expected = (rows,) if name == "sigma_mm" else (rows, 3)
+            expected = {"sigma_mm": (rows,), "origin": (3,)}.get(name, (rows, 3))
             if array.shape != expected:
                 raise InputError(f"The {name} have shape {array.shape}", f"{expected} is needed.")
             vars(shape)[name] = array
@@ -254,3 +258,15 @@ def opening_loops(faces: np.ndarray) -> list[np.ndarray]:
                 place[step] = len(path)
                 path.append(step)
     return loops
+
+
+_Surface = TypeVar("_Surface", PointSet, Mesh)
+
+
+def move_shape(T: Floats, shape: _Surface) -> _Surface:
+    """Return points or a mesh moved by a transform (4, 4) mm."""
+    where = "points" if isinstance(shape, PointSet) else "vertices"
+    moved = {where: move_points(T, getattr(shape, where))}
+    if shape.normals is not None:
+        moved["normals"] = shape.normals @ T[:3, :3].T
+    return replace(shape, **{name: each.astype(np.float32) for name, each in moved.items()})

@@ -6,9 +6,9 @@
                                i pitch)
 ``chessboard:9x7:75``          columns x rows of *inner corners* : side of a square in mm
 ``charuco:8x6:30``             columns x rows of *squares* : side of a square in mm; then, if they
-                               differ from the defaults, ``:marker mm`` (0.75 of the square) and
-                               ``:dictionary`` (DICT_5X5_1000). The layout is OpenCV's since 4.6:
-                               the top-left square is dark
+                               differ from the defaults, ``:marker mm`` (0.75 of the square),
+                               ``:dictionary`` (DICT_5X5_1000) and ``:first id`` of the markers
+                               (0). The layout is OpenCV's since 4.6: the top-left square is dark
 ``charuco-legacy:8x6:30``      the layout before OpenCV 4.6: with an even number of rows, the
                                top-left square is bright
 =============================  =====================================================================
@@ -20,7 +20,7 @@ Plugins add others (`BoardType`).
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -47,7 +47,37 @@ DEFAULT_MARKER = 0.75
 LEGACY = "charuco-legacy"
 MAX_STRETCH = 1.5
 """Largest ratio of the pitches along x and y."""
-_DICTIONARY = re.compile(r"DICT_([4-7])X\1_(50|100|250|1000)")
+DICTIONARIES = {f"DICT_{n}X{n}_{m}": m for n in (4, 5, 6, 7) for m in (50, 100, 250, 1000)} | {
+    "DICT_APRILTAG_16h5": 30,
+    "DICT_APRILTAG_25h9": 35,
+    "DICT_APRILTAG_36h10": 2320,
+    "DICT_APRILTAG_36h11": 587,
+    "DICT_ARUCO_MIP_36h12": 250,
+    "DICT_ARUCO_ORIGINAL": 1024,
+}
+"""Numbers of markers of OpenCV's dictionaries."""
+_DICTIONARY_NAMES = {name.upper(): name for name in DICTIONARIES}
+
+
+@dataclass(frozen=True)
+class Detection:
+    """Detected features: ``pixels`` (n, 2) float64 px, and ``ids`` (n,) int, their indices into
+    ``board.points``.
+
+    A circle's pixel is the centroid of its image, which perspective and distortion move away from
+    the image of its centre (some hundredths of a pixel; it grows with the square of the radius):
+    ``radius_mm``, 0 for corners, is there to correct that. ``marked``: the mark beside the first
+    circle was detected, so that the numbering is the board's own at any turn. ``others`` (k, n)
+    int: further ``ids`` that the image allows, where it does not show which of the board's features
+    these are. ``note``: what else is in view and not used.
+    """
+
+    pixels: Floats
+    ids: np.ndarray
+    radius_mm: float = 0.0
+    marked: bool = False
+    others: np.ndarray = field(default_factory=lambda: np.empty((0, 0), int))
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,6 +103,9 @@ class BoardType:
     margin_pitches: float = 0.0
 
 
+_APRILGRID = (
+    "; AprilGrids are read by a plugin, such as the one in docs/examples/slviewer-example-plugin"
+)
 BOARD_PLUGINS = PluginGroup("slviewer.boards", BoardType, lambda: EXAMPLES)
 
 
@@ -98,9 +131,9 @@ class Board:
 
     ``points``: the features, row by row: x along a row, y along a column, so that the normal (x
     cross y) points away from a camera that sees the printed side; the first feature is the origin.
-    ``marker_mm``, ``dictionary`` and ``legacy``, the layout before OpenCV 4.6, belong to ChArUco
-    boards only. ``kind``: a `Kind`, or the name of a plugin's `BoardType`. ``pitch_mm``: along x;
-    ``pitch_y_mm``: along y, by default the same.
+    ``marker_mm``, ``dictionary``, ``legacy``, the layout before OpenCV 4.6, and ``first_id``, the
+    number of the first marker, belong to ChArUco boards only. ``kind``: a `Kind`, or the name of a
+    plugin's `BoardType`. ``pitch_mm``: along x; ``pitch_y_mm``: along y, by default the same.
     """
 
     kind: str
@@ -111,6 +144,7 @@ class Board:
     dictionary: str = ""
     pitch_y_mm: float = 0.0
     legacy: bool = False
+    first_id: int = 0
 
     def __post_init__(self) -> None:
         example = _find_example(self.kind)
@@ -134,7 +168,7 @@ class Board:
             self._check_markers()
             # the layouts differ with an even number of rows only
             object.__setattr__(self, "legacy", self.legacy and self.rows % 2 == 0)
-        elif self.marker_mm or self.dictionary or self.legacy:
+        elif self.marker_mm or self.dictionary or self.legacy or self.first_id:
             raise InputError(f"a {self.kind} board has no markers", "omit marker and dictionary")
 
     def _check_pitches(self, example: str) -> None:
@@ -172,17 +206,18 @@ class Board:
                 f"markers of {self.marker_mm:g} mm do not fit squares of {self.pitch_mm:g} mm",
                 "give 0.2 to 0.95 of the square, as in 'charuco:8x6:30:22.5'",
             )
-        known = _DICTIONARY.fullmatch(self.dictionary)
-        if not known:
+        if self.dictionary not in DICTIONARIES:
             raise InputError(
-                f"'{self.dictionary}' is not a marker dictionary of OpenCV's 4x4 to 7x7 families",
-                "write for example 'charuco:8x6:30:22.5:DICT_5X5_1000'",
+                f"'{self.dictionary}' is not a marker dictionary of OpenCV",
+                f"write it as in 'charuco:8x6:30:22.5:DICT_5X5_1000', one of"
+                f" {', '.join(DICTIONARIES)}",
             )
-        needed = self.columns * self.rows // 2
-        if needed > int(known[2]):
+        available = DICTIONARIES[self.dictionary]
+        needed = self.marker_ids.stop
+        if not 0 <= self.first_id <= needed <= available:
             raise InputError(
-                f"a ChArUco board of {self.columns}x{self.rows} squares needs {needed} markers, and"
-                f" {self.dictionary} has {known[2]}",
+                f"a ChArUco board of {self.columns}x{self.rows} squares, from marker"
+                f" {self.first_id}, needs {needed} markers, and {self.dictionary} has {available}",
                 "choose a larger dictionary",
             )
 
@@ -196,10 +231,11 @@ class Board:
             raise InputError(
                 f"board '{notation}' is not understood",
                 f"start it with one of {', '.join(board_examples())}, for example"
-                f" '{EXAMPLES['circles']}'" + BOARD_PLUGINS.explain_missing(kind),
+                f" '{EXAMPLES['circles']}'"
+                + (_APRILGRID if kind == "aprilgrid" else BOARD_PLUGINS.explain_missing(kind)),
             )
         is_charuco = kind in ("charuco", LEGACY)
-        most = 4 if is_charuco else 2
+        most = 5 if is_charuco else 2
         if not 2 <= len(fields) <= most:
             raise InputError(
                 f"board '{notation}' has {len(fields)} fields after the kind",
@@ -217,9 +253,17 @@ class Board:
             for text in re.split("[xX×]", fields[1], maxsplit=1)
         )
         marker = _parse_millimetres(notation, fields[2], example) if len(fields) > 2 else 0.0
-        dictionary = fields[3].strip().upper() if len(fields) > 3 else ""
+        dictionary = fields[3].strip() if len(fields) > 3 else ""
+        dictionary = _DICTIONARY_NAMES.get(dictionary.upper(), dictionary)
+        first_id = fields[4].strip() if len(fields) > 4 else "0"
+        if not re.fullmatch(r"\d{1,4}", first_id):
+            raise InputError(
+                f"board '{notation}': '{first_id}' is not the first id of the markers, as in"
+                " 'charuco:8x6:30:22.5:DICT_5X5_1000:24'"
+            )
         columns, rows, pitch_y = int(size[1]), int(size[2]), along_y[0] if along_y else 0.0
-        return cls(kind, columns, rows, pitch, marker, dictionary, pitch_y)
+        board = cls(kind, columns, rows, pitch, marker, dictionary, pitch_y)
+        return replace(board, first_id=int(first_id))
 
     def __str__(self) -> str:
         pitch = _format_number(self.pitch_mm)
@@ -228,11 +272,13 @@ class Board:
         kind = LEGACY if self.legacy else self.kind
         fields = [kind, f"{self.columns}x{self.rows}", pitch]
         if self.kind == "charuco":
-            plain = self.dictionary == DEFAULT_DICTIONARY
+            plain = self.dictionary == DEFAULT_DICTIONARY and not self.first_id
             if not plain or self.marker_mm != DEFAULT_MARKER * self.pitch_mm:
                 fields.append(_format_number(self.marker_mm))
             if not plain:
                 fields.append(self.dictionary)
+            if self.first_id:
+                fields.append(str(self.first_id))
         return ":".join(fields)
 
     @property
@@ -243,6 +289,11 @@ class Board:
             return added.features(self)
         lost = 1 if self.kind == "charuco" else 0
         return self.columns - lost, self.rows - lost
+
+    @property
+    def marker_ids(self) -> range:
+        """Numbers of a ChArUco board's markers."""
+        return range(self.first_id, self.first_id + self.columns * self.rows // 2)
 
     @property
     def plugin_type(self) -> BoardType | None:

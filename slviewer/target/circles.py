@@ -2,26 +2,33 @@
 their centres: centroids of their ink, relative to the brightness of the paper around them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Self
 
 import cv2
 import numpy as np
 
 from slviewer.errors import BoardError, DetectionError
 from slviewer.geometry.jit import kernel, read_only, run_rows
-from slviewer.geometry.rigid import Floats, Floats32
+from slviewer.geometry.rigid import Floats, Floats32, Mask
 from slviewer.geometry.robust import select
 from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.target.blobs import Blobs, detect_blobs
-from slviewer.target.board import Board
+from slviewer.target.board import Board, Detection
 from slviewer.target.images import MIRRORED, SEARCH_PX, BoardImage, light_advice, resize_image
 from slviewer.target.lattice import (
     AREA_RATIO,
+    CLUTTER_FREE_SHARE,
     NODE_RADIUS,
+    BoardPart,
     Lattice,
     complete_lattice,
+    describe_sides,
     grow_lattices,
+    match_part,
     match_pattern,
+    neighbouring_rows,
+    select_part,
 )
 from slviewer.target.mark import is_mark_mirrored, select_numbering_by_mark
 from slviewer.target.planar import (
@@ -31,12 +38,11 @@ from slviewer.target.planar import (
     check_grid,
     fit_grid_map,
     fit_homography,
+    is_on_grid,
     jacobians,
     select_upright,
 )
 
-CLUTTER_FREE_SHARE = 1 / 3
-"""Share of the board's circles in one lattice that clutter never reaches."""
 SQUARE_LIMIT_ROUNDNESS = 0.97
 """Limit between the roundness of squares, 0.955, and of well-resolved circles, 0.985 and more on
 real photographs."""
@@ -64,6 +70,10 @@ GATE_SIGMAS = 4.0
 FLATNESS = 0.04
 """Pixels of the ring are background within so many standard deviations of its plane, or this share
 of the contrast."""
+SAME_PAPER = 0.78
+"""Least brightness of paper over that beside it, and its inverse the largest."""
+NEAR_EDGE = (0.15, 0.3, 0.5)
+"""Where beside a board's border there is paper, from the next row of circles on, in steps."""
 MIN_RING_PIXELS = 8
 """Smallest number of pixels for a plane fit."""
 
@@ -84,15 +94,19 @@ class _Binarisation:
 
 @dataclass(frozen=True)
 class _Grid:
-    """A detected board: its blobs and the equally valid ``numberings``, (n,) indices into them."""
+    """A detected board: its blobs and the equally valid ``numberings``, (n,) indices into them, -1
+    where a circle is hidden; ``others``: those of other places of the board, of which the image
+    shows the same circles."""
 
     blobs: Blobs
     numberings: list[np.ndarray]
+    others: list[np.ndarray] = field(default_factory=list)
 
     @property
     def centres(self) -> Floats:
-        """(n, 2) px: the circles' centres."""
-        return self.blobs.centres[self.numberings[0]]
+        """(m, 2) px: centres of the circles that are seen."""
+        order = self.numberings[0]
+        return self.blobs.centres[order[order >= 0]]
 
     @property
     def area_px(self) -> float:
@@ -100,12 +114,10 @@ class _Grid:
         return cv2.contourArea(cv2.convexHull(self.centres.astype(np.float32)))
 
 
-def detect_circles(board: Board, image: BoardImage) -> tuple[Floats, float, bool]:
-    """Detect every circle of a board.
+def detect_circles(board: Board, image: BoardImage) -> Detection:
+    """Detect every circle of a board that is not beyond the image's border or the light.
 
-    Returns the centres (n, 2) float64 px in the order of ``board.points``, the circles' radius in
-    mm, and whether the board's mark was detected. Raises DetectionError, whose message gives the
-    number of circles detected.
+    Raises DetectionError, whose message gives the number of circles detected.
     """
     tried: list[_Binarisation] = []
     for attempt in _binarise_all(board, image.grey):
@@ -125,10 +137,22 @@ def detect_circles(board: Board, image: BoardImage) -> tuple[Floats, float, bool
         pool = _pool_blobs(
             most.blobs, [attempt.blobs for attempt in tried if attempt.blobs.inverted == inverted]
         )
-        grid = _match_board(board, complete_lattice(most.largest, pool), pool, image)
+        lattice = complete_lattice(most.largest, pool)
+        grid = _match_board(board, lattice, pool, image) or _match_part(board, lattice, pool, image)
         if grid:
             return _measure(board, image, grid)
     raise _describe_failure(board, image, most)
+
+
+def list_grids(image: BoardImage) -> Iterator[tuple[int, int]]:
+    """Yield columns and rows, the longer first, of the whole rectangular grids of circles that an
+    image shows."""
+    smallest = Board("circles", 7, 6, 1.0)
+    for attempt in _binarise_all(smallest, image.grey):
+        for lattice in attempt.lattices:
+            columns, rows = lattice.extent
+            if rows >= 3 and len(lattice) == columns * rows:
+                yield columns, rows
 
 
 def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
@@ -187,6 +211,94 @@ def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage
     return None
 
 
+def _match_part(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage) -> _Grid | None:
+    """Match a lattice with a board of which the rest is beyond the image's border, or without
+    light; None unless its borders or its mark tell which circles these are, or leave few places."""
+    if blobs.inverted or len(lattice) <= CLUTTER_FREE_SHARE * len(board.points):
+        return None
+    try:
+        whole, grid_map = _select_whole(lattice, blobs, image)
+    except DetectionError:
+        return None
+    if len(whole) <= CLUTTER_FREE_SHARE * len(board.points):
+        return None
+    steps = jacobians(grid_map.H, whole.nodes.mean(0, keepdims=True))[0]
+    around = _Surroundings.of(image.grey, grid_map, whole, blobs)
+    places = match_part(board, whole, steps, around)
+    every = [order for place in places for order in place.numberings]
+    marked = select_numbering_by_mark(board, image.deep, blobs.centres, every) if every else None
+    part = select_part(board, blobs.centres, places, image.grey.shape, marked)
+    return _Grid(blobs, [part.numbering], part.others) if part else None
+
+
+def _select_whole(lattice: Lattice, blobs: Blobs, image: BoardImage) -> tuple[Lattice, GridMap]:
+    """Return the part of a lattice whose circles are, with their blurred edges, inside an image and
+    uncovered, and its map. Raises DetectionError where they do not determine one."""
+    seen = blobs.select(lattice.blobs)
+    reach = 2 * np.sqrt(np.diagonal(seen.covariances, axis1=1, axis2=2))
+    is_whole = _is_inside(seen.centres, reach + 2 * EDGE_WIDTH_PX, image.grey.shape)
+    is_whole &= (seen.areas <= MIN_SHAPE_AREA_PX) | (seen.roundness >= WHOLE_CIRCLE_ROUNDNESS)
+    pixels = refine_centres(image.deep, seen)
+    is_whole &= finite_rows(pixels)
+    for _ in range(2):
+        nodes = lattice.nodes[is_whole].astype(float)
+        grid_map = fit_grid_map(nodes, pixels[is_whole], robust=True)
+        is_whole[is_whole] = is_on_grid(grid_map, grid_map.pitch_px(nodes))
+    return Lattice(lattice.nodes[is_whole], lattice.blobs[is_whole]), grid_map
+
+
+def _is_inside(pixels: Floats, reach: Floats | float, shape: tuple[int, ...]) -> Mask:
+    """Return whether pixels (n, 2) are inside an image (h, w) by a ``reach`` px, for all or for
+    each, along u and v."""
+    last = np.array(shape[::-1]) - 1 - reach
+    return np.asarray(((pixels >= reach) & (pixels <= last)).all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Surroundings:
+    """What an image ``grey`` (h, w) uint8 shows at the nodes of a lattice, by the lattice's map.
+
+    ``radius``: of the circles, in pitches; ``seen`` (m, 2): the lattice's nodes, and ``paper``
+    (m,): grey level of the paper around their circles.
+    """
+
+    grey: np.ndarray
+    grid_map: GridMap
+    radius: float
+    seen: Floats
+    paper: Floats
+
+    @classmethod
+    def of(cls, grey: np.ndarray, grid_map: GridMap, lattice: Lattice, blobs: Blobs) -> Self:
+        """Return the surroundings of a lattice."""
+        pitch = grid_map.pitch_px(lattice.nodes.astype(float))
+        radius = float(np.median(np.sqrt(blobs.areas[lattice.blobs] / np.pi) / pitch))
+        smooth = cv2.medianBlur(grey, 3)
+        across = 2 * int(radius * np.median(pitch) + EDGE_WIDTH_PX) + 1
+        u, v = np.rint(blobs.centres[lattice.blobs]).astype(int).T
+        brightest = cv2.dilate(smooth, np.ones((across, across), np.uint8))[v, u]
+        return cls(smooth, grid_map, radius, lattice.nodes.astype(float), brightest.astype(float))
+
+    def is_outside(self, nodes: Floats) -> Mask:
+        """See ``lattice.Surroundings``."""
+        places, pitch = self.grid_map.extrapolate(nodes), self.grid_map.pitch_px(nodes)
+        reach = (self.radius + NODE_RADIUS) * pitch + 2 * EDGE_WIDTH_PX
+        return ~(_is_inside(places, reach[:, None], self.grey.shape) & (pitch > 0))
+
+    def shows_end(self, nodes: Floats, nearest: np.ndarray) -> Mask:
+        """See ``lattice.Surroundings``."""
+        paper, seen = self.paper[nearest], self.seen[nearest]
+        levels = [self._level(nodes + share * (seen - nodes)) / paper for share in NEAR_EDGE]
+        return np.all([(each > SAME_PAPER) & (each < 1 / SAME_PAPER) for each in levels], axis=0)
+
+    def _level(self, nodes: Floats) -> Floats:
+        """Return the grey levels (k,) at nodes (k, 2); NaN outside the image."""
+        places = self.grid_map.extrapolate(nodes)
+        inside = _is_inside(places, 0.0, self.grey.shape)
+        u, v = np.rint(np.where(inside[:, None], places, 0.0)).astype(int).T
+        return np.where(inside, self.grey[v, u], np.nan)
+
+
 def _fit_map(board: Board, blobs: Blobs) -> GridMap | None:
     """Fit the map from board to image; None unless the blobs, in the board's order, form a grid of
     equal circles."""
@@ -214,7 +326,7 @@ def _grid_continues(board: Board, grid_map: GridMap, blobs: Blobs, numbering: np
     others = blobs.select(np.delete(np.arange(len(blobs.centres)), numbering))
     if not len(others.centres):
         return False
-    for side in _neighbouring_rows(board):
+    for side in neighbouring_rows(board):
         pitch = grid_map.pitch_px(side)
         apart = lengths(grid_map.to_image(side)[:, None] - others.centres)
         gate = np.maximum(MAX_GRID_OFFSET * pitch, 2 * MAX_GRID_OFFSET_SIGMAS * grid_map.sigma_px)
@@ -224,18 +336,6 @@ def _grid_continues(board: Board, grid_map: GridMap, blobs: Blobs, numbering: np
         if np.count_nonzero(on) >= max(2.0, CONTINUATION_SHARE * len(side)):
             return True
     return False
-
-
-def _neighbouring_rows(board: Board) -> list[Floats]:
-    """Return the positions (k, 2), in pitches, of one more row or column of circles at each of the
-    four sides."""
-    columns, rows = board.features
-    across, down = np.arange(columns), np.arange(rows)
-    sides = []
-    for j, i in ((across, -1), (across, rows), (-1, down), (columns, down)):
-        x = 2 * j + i % 2 if board.kind == "acircles" else j
-        sides.append(np.stack(np.broadcast_arrays(x, i), axis=1).astype(float))
-    return sides
 
 
 def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
@@ -252,9 +352,8 @@ def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
     return grids[0]
 
 
-def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[Floats, float, bool]:
-    """Number the grid and refine its centres; returns (pixels (n, 2), radius in mm, whether the
-    mark was detected).
+def _measure(board: Board, image: BoardImage, grid: _Grid) -> Detection:
+    """Number the grid and refine its centres.
 
     Raises DetectionError where blobs are squares or partly covered circles, and where a centre
     cannot be measured or fits no grid.
@@ -263,11 +362,14 @@ def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[Floats, floa
     if marked is None and is_mark_mirrored(board, image.deep, grid.blobs.centres, grid.numberings):
         raise BoardError(*MIRRORED, cause="axis-reversed")
     order = select_upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
-    blobs = grid.blobs.select(order)
+    ids, seen, others = BoardPart(order, grid.others).list_features()
+    blobs = grid.blobs.select(seen)
     large = blobs.areas > MIN_SHAPE_AREA_PX
     if large.all() and np.median(blobs.roundness) < SQUARE_LIMIT_ROUNDNESS:
         raise DetectionError(
-            f"a grid of squares detected where {board} has circles", "check the board's kind"
+            f"a grid of squares, or of blurred or small circles, detected where {board} has"
+            " circles",
+            "check the board's kind, focus the camera, and move the board closer",
         )
     covered = np.count_nonzero(large & (blobs.roundness < WHOLE_CIRCLE_ROUNDNESS))
     if covered:
@@ -283,11 +385,11 @@ def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[Floats, floa
             " to measure",
             "move the board closer, or focus the camera",
         )
-    check_grid(board, pixels, np.arange(len(pixels)), "circles")
-    points = board.points[:, :2]
+    check_grid(board, pixels, ids, "circles")
+    points = board.points[ids, :2]
     scale = np.linalg.det(jacobians(fit_homography(points, blobs.centres), points))
     radius_mm = float(np.sqrt(np.median(blobs.areas / scale) / np.pi))
-    return pixels, radius_mm, marked is not None
+    return Detection(pixels, ids, radius_mm, marked is not None, others)
 
 
 def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
@@ -326,15 +428,7 @@ def _describe_failure(
     facts = [f"{detected} of {total} circles of {board} detected"]
     if others:
         facts.append(f"among {others} other round blobs")
-    centres = most.blobs.centres[most.largest.blobs]
-    spacing = np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / ((longer - 1) * (shorter - 1)))
-    left, upper = centres.min(0)
-    right, lower = np.array(image.grey.shape[::-1]) - 1 - centres.max(0)
-    gaps = {"left": left, "right": right, "upper": upper, "lower": lower}
-    # a circle that the border cuts is not detected
-    sides = [side for side, gap in gaps.items() if gap < 1.5 * spacing]
-    if sides:
-        facts.append(f"up to the {' and the '.join(sides)} border of the image")
+    facts += describe_sides(most.blobs.centres[most.largest.blobs], image.grey.shape)
     return DetectionError(", ".join(facts), light_advice(image.grey))
 
 

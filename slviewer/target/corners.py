@@ -1,5 +1,5 @@
-"""Detect the inner corners of chessboards and of ChArUco boards, whose markers identify them, so
-that a part of such a board is enough; and refine them to a fraction of a pixel.
+"""Detect the inner corners of chessboards that are in view, and refine corners to a fraction of a
+pixel.
 
 A corner is where two blurred edges cross, fitted to the grey levels around it. The model is
 ``I = P (1 + kappa E_1 E_2)``: P the plane of the light, kappa the contrast, E_k the blurred step
@@ -8,19 +8,21 @@ light moves it; gradient-based refinement (OpenCV's ``cornerSubPix``) is off by 
 the same images.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 import scipy
 
-from slviewer.errors import BoardError, DetectionError
+from slviewer.errors import DetectionError, InputError
+from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rigid import Floats, Floats32, Mask
 from slviewer.geometry.vectors import lengths
-from slviewer.target.board import Board
+from slviewer.target.blobs import Blobs
+from slviewer.target.board import Board, Detection
 from slviewer.target.images import (
-    MIRRORED,
     SEARCH_PX,
     BoardImage,
     flatten_light,
@@ -28,15 +30,30 @@ from slviewer.target.images import (
     resize_image,
     to_full_image,
 )
-from slviewer.target.planar import check_grid, fit_homography, jacobians, select_upright, to_image
+from slviewer.target.lattice import (
+    CLUTTER_FREE_SHARE,
+    COMPLETIONS,
+    MAX_SIDE_NODES,
+    NODE_RADIUS,
+    SHEARS,
+    Lattice,
+    grow_lattices,
+    match_part,
+    select_part,
+)
+from slviewer.target.planar import (
+    GridMap,
+    check_grid,
+    fit_grid_map,
+    fit_homography,
+    is_on_grid,
+    jacobians,
+)
 
 MIN_CORNERS = 8
 """Smallest number of corners of a pose."""
 SUFFICIENT_SHARE = 0.8
-"""Share of the corners at which the search ends; below it continues at higher resolution."""
-MARKER_TOLERANCE = 0.5
-"""Largest distance, in squares, of a marker's corner from its place in a layout."""
-MIN_MARKER_CORNERS = 8
+"""Share of the corners at which the search ends; below it continues at another resolution."""
 MIN_CONTRAST = 1.12
 """Bright over dark squares around a corner."""
 MAX_HALF_WIDTH_PX = 11
@@ -47,260 +64,254 @@ MAX_MISFIT = 0.15
 MAX_RELATIVE_MISFIT = 3.0
 """Largest RMS misfit of a corner's grey levels: over its contrast, and over the median misfit of
 all corners."""
+SADDLE_PX = 5
+"""Radius of the ring on which a corner is detected."""
+MIN_RESPONSE = 120.0
+"""Smallest response of the ring: a quarter of the contrast of black on white."""
+COHERENCE = 0.8
+"""Least resultant of the phases of a chessboard's corners, of which every other one is turned."""
+QUADRANTS = 0.25 * np.array([(-1, -1), (1, 1), (1, -1), (-1, 1)])
+"""Where the four squares at a corner are read, in squares."""
+END = 0.2
+"""Distance in squares at which the outermost squares' end is seen."""
+PAPER_SHARE = 0.3
+"""Largest difference of paper from the bright squares, over the contrast."""
 ITERATIONS = 15
 CONVERGENCE_PX = 1e-3
 
 
-def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Return the board as an OpenCV ``CharucoBoard``."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    charuco = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary
-    )
-    charuco.setLegacyPattern(board.legacy)
-    return charuco
+def detect_chessboard(board: Board, image: BoardImage) -> Detection:
+    """Detect the inner corners that are in view, lit and uncovered.
 
-
-def detect_charuco(board: Board, image: BoardImage) -> tuple[Floats, np.ndarray]:
-    """Detect corners; returns pixels (n, 2) float64 and ids (n,) int.
-
-    Raises DetectionError for too few corners, and BoardError for markers in the other layout and
-    for a mirror image.
+    Raises DetectionError, whose message gives the number of corners detected, also where the image
+    does not show which part of the board these are.
+    A board that has differently coloured corners is numbered so that its top-left square is dark.
     """
-    detector = cv2.aruco.CharucoDetector(opencv_board(board))
-    first = min(1.0, SEARCH_PX / max(image.grey.shape))
-    pixels, ids = np.empty((0, 2)), np.empty(0, int)
-    markers = 0
-    for factor in dict.fromkeys((first / 2, first, 1.0)):
-        small = resize_image(image.grey, factor)
-        corners, numbers, outlines, marker_ids = detector.detectBoard(small)
-        markers = max(markers, 0 if marker_ids is None else len(marker_ids))
-        _check_layout(board, outlines, marker_ids)
-        if numbers is not None and len(numbers) > len(ids):
-            pixels = to_full_image(np.reshape(corners, (-1, 2)), factor)
-            ids = np.ravel(numbers).astype(int)
-        if len(ids) >= SUFFICIENT_SHARE * len(board.points):
-            break
-    if len(ids) >= MIN_CORNERS:
-        points = board.points[ids][:, :2]
-        pixels, good = refine_corners(image.deep, pixels, points, board.pitches, board.marker_mm)
-        pixels, ids = pixels[good], ids[good]
-    if markers < 2:
-        mirrored = np.ascontiguousarray(resize_image(image.grey, first / 2)[:, ::-1])
-        _, _, outlines, marker_ids = detector.detectBoard(mirrored)
-        layouts = (board, replace(board, legacy=not board.legacy))
-        if max(_count_fitting(each, outlines, marker_ids) for each in layouts) > MIN_MARKER_CORNERS:
-            raise BoardError(*MIRRORED, cause="axis-reversed")
-    if len(ids) < MIN_CORNERS:
-        total_markers = board.columns * board.rows // 2
+    seen = _detect_largest(image, len(board.points))
+    if seen is None:
         raise DetectionError(
-            f"{len(ids)} of {len(board.points)} corners and {markers} of {total_markers} markers of"
-            f" {board} detected, and a pose needs {MIN_CORNERS}",
-            f"{light_advice(image.grey)}",
-        )
-    check_grid(board, pixels, ids, "corners")
-    return pixels, ids
-
-
-def _check_layout(
-    board: Board, outlines: Sequence[np.ndarray], marker_ids: np.ndarray | None
-) -> None:
-    """Raise BoardError where the markers, with ``outlines`` (4, 2) px each, are placed as in the
-    layout that the board does not have: that before, or that since OpenCV 4.6."""
-    other = replace(board, legacy=not board.legacy)
-    if other == board:  # alike with an odd number of rows
-        return
-    count, count_other = (_count_fitting(each, outlines, marker_ids) for each in (board, other))
-    if count_other >= max(MIN_MARKER_CORNERS, count + 4):  # a marker more
-        raise BoardError(
-            f"{count_other} of {4 * len(outlines)} corners of the markers fit {other}, a layout"
-            f" {'before' if other.legacy else 'since'} OpenCV 4.6, and {count} fit {board}",
-            f"give the board as {other}",
-            cause="board-size",
-        )
-
-
-def _count_fitting(
-    board: Board, outlines: Sequence[np.ndarray], marker_ids: np.ndarray | None
-) -> int:
-    """Return how many of the markers' corners, (4, 2) px each, fit their places on the board by one
-    homography."""
-    places = np.array(opencv_board(board).getObjPoints())[..., :2]
-    ids = np.empty(0, int) if marker_ids is None else np.ravel(marker_ids)
-    known = np.flatnonzero(ids < len(places))
-    if len(known) < 2:
-        return 0
-    pixels = np.reshape(outlines, (-1, 4, 2))[known].reshape(-1, 2)
-    points = places[ids[known]].reshape(-1, 2)
-    tolerance = MARKER_TOLERANCE * board.pitch_mm
-    H, _ = cv2.findHomography(pixels, points, cv2.RANSAC, tolerance)
-    if H is None:
-        return 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return int(
-            np.count_nonzero(lengths(to_image(np.asarray(H, float), pixels) - points) < tolerance)
-        )
-
-
-def detect_chessboard(board: Board, image: BoardImage) -> Floats:
-    """Detect every inner corner: (n, 2) float64 px in the order of ``board.points``.
-
-    Raises DetectionError, whose message gives the number of corners detected.
-    A board whose columns + rows are odd is numbered so that its top-left square is dark.
-    """
-    first_error: DetectionError | None = None
-    for grid in _detect_grids(board, image.grey):
-        try:
-            return _verify_grid(board, image, grid)
-        except DetectionError as error:
-            first_error = first_error or error
-    largest = _detect_largest(image.grey)
-    is_larger = largest is not None and largest[..., 0].size > len(board.points)
-    if first_error is None or is_larger:
-        raise _describe_failure(board, image.grey, largest)
-    raise first_error
-
-
-def _verify_grid(board: Board, image: BoardImage, grid: Floats) -> Floats:
-    """Refine and number a grid (rows, columns, 2) px of any orientation; returns the corners (n, 2)
-    px.
-
-    Raises DetectionError where a corner cannot be measured or the grid is not the board's.
-    """
-    # the detectors' own order may be mirrored; only the neighbourhood relation is used
-    (a, b), (c, d) = (np.diff(grid, axis=axis).mean((0, 1)) for axis in (1, 0))
-    if a * d < b * c:  # v points down
-        grid = grid[:, ::-1]
-    pixels, good = refine_corners(
-        image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitches
-    )
-    if not good.all():
-        raise DetectionError(
-            f"{np.count_nonzero(~good)} of {len(good)} corners are covered or blurred beyond"
-            " measuring",
-            "uncover the board, focus the camera, and avoid reflections",
-        )
-    check_grid(board, pixels, np.arange(len(pixels)), "corners")
-    grid = pixels.reshape(grid.shape)
-    first_is_dark = _is_first_square_dark(image.deep, grid)
-    _refuse_larger(board, image.deep, grid)
-    numberings = _list_numberings(np.arange(len(pixels)).reshape(grid.shape[:2]), first_is_dark)
-    return pixels[select_upright(board, pixels, numberings)]
-
-
-def _detect_grids(board: Board, grey: np.ndarray) -> Iterator[Floats]:
-    """Yield grids (rows, columns, 2) px of the board's size, good to a pixel or two, of any
-    orientation, of which the caller takes the first that is right.
-
-    They are those of OpenCV's sector-based search, the largest grid if it has the board's size, and
-    that of OpenCV's older search, which links squares by their corners.
-    """
-    scale, shape = min(1.0, SEARCH_PX / max(grey.shape)), (board.rows, board.columns, 2)
-    even = flatten_light(grey)
-    thorough = cv2.CALIB_CB_EXHAUSTIVE
-    for source, factor, flags in (  # the fastest first
-        (even, scale / 2, 0),
-        (grey, scale / 2, 0),
-        (even, scale / 2, thorough),
-        (even, scale, thorough),
-        (grey, scale, 0),
-    ):
-        success, corners = cv2.findChessboardCornersSB(
-            resize_image(source, factor), board.features, flags=flags
-        )
-        if success:
-            yield to_full_image(corners, factor).reshape(shape)
-            break
-    largest = _detect_largest(grey)
-    if largest is not None and sorted(largest.shape[:2]) == sorted(board.features):
-        yield largest if largest.shape[0] == board.rows else largest.transpose(1, 0, 2)
-    success, corners = cv2.findChessboardCorners(resize_image(grey, scale / 2), board.features)
-    if success:
-        yield to_full_image(corners, scale / 2).reshape(shape)
-
-
-def _detect_largest(grey: np.ndarray) -> Floats | None:
-    """Detect the largest grid of corners (rows, columns, 2) px of any chessboard; None below
-    3x3."""
-    factor = min(1.0, SEARCH_PX / max(grey.shape)) / 2
-    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
-    flattened = resize_image(flatten_light(grey), factor)
-    success, corners, cells = cv2.findChessboardCornersSBWithMeta(flattened, (3, 3), flags)
-    return to_full_image(corners, factor).reshape(*cells.shape[:2], 2) if success else None
-
-
-def _describe_failure(board: Board, grey: np.ndarray, largest: Floats | None) -> DetectionError:
-    """Return the error: the largest chessboard detected, if any, and what to do."""
-    if largest is None:
-        return DetectionError(
             f"no chessboard detected where {board} has {len(board.points)} corners",
-            light_advice(grey),
+            light_advice(image.grey),
         )
-    rows, columns = largest.shape[:2]
-    if rows * columns <= len(board.points):
-        return DetectionError(
-            f"{rows * columns} of {len(board.points)} corners of {board} detected"
-            f" ({columns}x{rows})",
-            light_advice(grey),
-        )
-    return DetectionError(
-        f"a chessboard of {columns}x{rows} inner corners detected, {board} expected",
-        "check its columns and rows",
-    )
+    return _number_corners(board, image, seen)
 
 
-def _is_first_square_dark(image: np.ndarray, grid: Floats) -> bool:
-    """Return whether the square outside the first corner is dark.
+def recognise_chessboard(image: BoardImage) -> tuple[Board, Detection] | None:
+    """Return the largest chessboard in view, with squares of 1 mm, the longer side first, and its
+    detection; None where there is none, or it cannot be numbered."""
+    seen = _detect_largest(image, np.inf)
+    if seen is None:
+        return None
+    with suppress(InputError):
+        board = Board("chessboard", *seen.lattice.extent, 1.0)
+        return board, _number_corners(board, image, seen)
+    return None
 
-    Raises DetectionError where dark and bright squares do not alternate.
-    """
-    colours = corner_polarity(image, grid, np.gradient(grid, axis=1), np.gradient(grid, axis=0))
-    colours = colours * np.where(np.indices(colours.shape).sum(0) % 2, -1, 1)
-    good = max(np.count_nonzero(colours > 0), np.count_nonzero(colours < 0))
-    if good < colours.size:
+
+def _number_corners(board: Board, image: BoardImage, seen: "_Corners") -> Detection:
+    """Return the detection of a board by the corners that are seen. Raises DetectionError where
+    they are not the board's, or the image does not show which of its corners these are."""
+    lattice = seen.lattice
+    longer, shorter = lattice.extent
+    if longer > max(board.features) or shorter > min(board.features):
         raise DetectionError(
-            f"at {colours.size - good} of {colours.size} corners no dark and bright squares"
-            " alternate",
-            "move the board so that all of it is in view, uncovered and without reflections",
+            f"a chessboard of {longer}x{shorter} inner corners detected, {board} expected",
+            "check its columns and rows",
         )
-    return bool(colours[0, 0] > 0)
-
-
-def _refuse_larger(board: Board, image: np.ndarray, grid: Floats) -> None:
-    """Raise DetectionError where the squares continue outside the grid, which may then be shifted
-    by a row."""
-    for side in range(4):
-        rotated = np.rot90(grid, side)
-        outside = 3 * rotated[0] - 3 * rotated[1] + rotated[2]
-        polarity = corner_polarity(
-            image, outside, np.gradient(outside, axis=0), rotated[0] - outside
+    count = f"{len(lattice)} of {len(board.points)} corners of {board} detected"
+    if len(lattice) <= CLUTTER_FREE_SHARE * len(board.points):
+        raise DetectionError(f"{count} ({longer}x{shorter})", light_advice(image.grey))
+    steps = jacobians(seen.grid_map.H, seen.nodes.mean(0, keepdims=True))[0]
+    places = match_part(board, lattice, steps, seen, seen.polarity > 0)
+    part = select_part(board, seen.pixels, places, image.grey.shape)
+    if part is None:
+        raise DetectionError(
+            f"{count} ({longer}x{shorter}), and the board ends beside these or is covered",
+            "check its columns and rows, and uncover it",
         )
-        if (
-            np.count_nonzero(polarity) > 0.5 * len(polarity)
-            and (np.diff(polarity[polarity != 0]) != 0).mean() > 0.5
-        ):
-            raise DetectionError(
-                f"the chessboard goes on beyond the {board.columns}x{board.rows} inner corners of"
-                f" {board}",
-                "check the board's columns and rows",
-            )
+    ids, order, others = part.list_features()
+    check_grid(board, seen.pixels[order], ids, "corners")
+    return Detection(seen.pixels[order], ids, others=others)
 
 
-def _list_numberings(order: np.ndarray, first_is_dark: bool) -> list[np.ndarray]:
-    """Return the flattened rotations of the corners' ``order`` (rows, columns) that the squares'
-    colours allow."""
-    rows, columns = order.shape
-    turns = range(0, 4, 1 if rows == columns else 2)
-    numberings = [np.rot90(order, turn).ravel() for turn in turns]
-    # the square outside the first corner, after the rotation, was the one outside another corner
-    # of the grid
-    squares = [(0, columns, rows + columns, rows)[turn] for turn in turns]
-    dark = [
-        numbering
-        for numbering, square in zip(numberings, squares, strict=True)
-        if first_is_dark == (square % 2 == 0)
-    ]
-    return dark or numberings
+@dataclass(frozen=True, eq=False)
+class _Corners:
+    """Corners (n, 2) px of a chessboard in an image (h, w), at ``nodes`` (n, 2) int of a lattice,
+    with the map between these, and ``polarity`` (n,): see ``corner_polarity``."""
+
+    image: Floats32
+    grid_map: GridMap
+    nodes: np.ndarray
+    pixels: Floats
+    polarity: np.ndarray
+
+    @property
+    def lattice(self) -> Lattice:
+        """The corners as a lattice."""
+        return Lattice(self.nodes, np.arange(len(self.nodes)))
+
+    @cached_property
+    def levels(self) -> Floats:
+        """(2, n): grey levels of the dark and of the bright squares at each corner."""
+        quadrants = self._read(self.nodes[None] + QUADRANTS[:, None])
+        return np.sort([quadrants[:2].mean(0), quadrants[2:].mean(0)], axis=0)
+
+    def is_outside(self, nodes: Floats) -> Mask:
+        """See ``lattice.Surroundings``."""
+        return np.asarray(np.isnan(self._read(nodes + 2 * QUADRANTS[:, None])).any(axis=0))
+
+    def shows_end(self, nodes: Floats, nearest: np.ndarray) -> Mask:
+        """See ``lattice.Surroundings``: of the two squares between a corner and the next node one
+        is dark, up to there, and beyond there is paper."""
+        inwards = self.nodes[nearest] - nodes
+        beside = 0.5 * inwards[:, ::-1] * (1, -1)
+        places = np.array(
+            [[nodes + side * beside + END * away * inwards for side in (-1, 1)] for away in (1, -1)]
+        )
+        inner, outer = self._shares(places, nearest)
+        is_end = (inner.min(0) < 1 - PAPER_SHARE) & _is_paper(inner.max(0))
+        return np.asarray(is_end & _is_paper(outer).all(axis=0))
+
+    def _shares(self, nodes: Floats, nearest: np.ndarray) -> Floats:
+        """Return grey levels (..., k) at nodes (..., k, 2): 0 as the dark squares at the corners
+        ``nearest`` (k,), 1 as the bright ones."""
+        dark, bright = self.levels[:, nearest]
+        return (self._read(nodes) - dark) / np.maximum(bright - dark, 1e-6)
+
+    def _read(self, nodes: Floats) -> Floats:
+        """Return the grey levels (...) at nodes (..., 2); NaN outside the image."""
+        if not nodes.size:
+            return np.empty(nodes.shape[:-1])
+        pixels = self.grid_map.extrapolate(nodes.reshape(-1, 2)).astype(np.float32)
+        levels = cv2.remap(
+            self.image, pixels[:, None, 0], pixels[:, None, 1], cv2.INTER_LINEAR, borderValue=np.nan
+        )
+        return levels.reshape(nodes.shape[:-1]).astype(np.float64)
+
+
+def _is_paper(shares: Floats) -> Mask:
+    """Return whether grey levels, as shares of the contrast, are those of paper."""
+    return np.asarray(np.abs(shares - 1) < PAPER_SHARE)
+
+
+def _detect_largest(image: BoardImage, wanted: float) -> _Corners | None:
+    """Detect the largest grid of corners of any chessboard, of ``wanted`` ones if possible, at the
+    search resolution, half of it, the full and twice the full resolution, as far as these can
+    improve it; None below 3x3."""
+    first = min(1.0, SEARCH_PX / max(image.grey.shape))
+    even = flatten_light(image.grey)
+    largest: _Corners | None = None
+    for factor in dict.fromkeys((first, first / 2, 1.0, 2.0)):
+        count = len(largest.nodes) if largest else 0
+        if count > SUFFICIENT_SHARE * wanted or (factor > 1 and not count):
+            break
+        saddles = _detect_saddles(resize_image(even, factor))
+        for lattice in grow_lattices(saddles.blobs):
+            if len(lattice) > max(MIN_CORNERS, len(largest.nodes) if largest else 0):
+                largest = _complete_corners(image, saddles, lattice, factor) or largest
+    return largest
+
+
+@dataclass(frozen=True, eq=False)
+class _Saddles:
+    """Points (n, 2) px about which dark and bright alternate twice, with the ``phase`` (n,) rad of
+    that, which is opposite at neighbouring corners of a chessboard."""
+
+    pixels: Floats
+    phase: Floats
+
+    @property
+    def blobs(self) -> Blobs:
+        """The points as blobs, all alike, of which lattices grow."""
+        n = len(self.pixels)
+        return Blobs(self.pixels, np.ones(n), np.tile(np.eye(2), (n, 1, 1)), False)
+
+
+def _detect_saddles(grey: np.ndarray) -> _Saddles:
+    """Detect points where two dark and two bright squares meet in an image (h, w) uint8: by the
+    ring of ChESS (Bennett and Lasenby, 2014)."""
+    image = cv2.GaussianBlur(grey, (3, 3), 0).astype(np.float32)
+    angles = np.arange(16) * np.pi / 8
+    height, width = image.shape
+    padded = cv2.copyMakeBorder(image, *(SADDLE_PX,) * 4, cv2.BORDER_REPLICATE)
+    ring = [
+        padded[v : v + height, u : u + width]
+        for u, v in np.rint(
+            SADDLE_PX * (1 + np.stack([np.cos(angles), np.sin(angles)], axis=1))
+        ).astype(int).tolist()
+    ]  # fmt: skip
+    opposite = [ring[k] + ring[k + 8] for k in range(8)]
+    response = -np.abs(16 * cv2.blur(image, (3, 3)) - sum(opposite))
+    for k in range(4):
+        response += np.abs(opposite[k] - opposite[k + 4])
+    for k in range(8):
+        response -= np.abs(ring[k] - ring[k + 8])
+    highest = cv2.dilate(response, np.ones((SADDLE_PX, SADDLE_PX), np.uint8))
+    v, u = np.nonzero((response == highest) & (response > MIN_RESPONSE))
+    turning = sum(
+        opposite[k][v, u] * np.exp(2j * angle) for k, angle in enumerate(angles[:8].tolist())
+    )
+    return _Saddles(np.stack([u, v], axis=1).astype(float), np.angle(turning))
+
+
+def _complete_corners(
+    image: BoardImage, saddles: _Saddles, lattice: Lattice, factor: float
+) -> _Corners | None:
+    """Return the refined corners at the nodes of a ``lattice`` of saddles, and at those that its
+    map predicts around it, in an image that was resized by ``factor`` for these; None where they
+    do not alternate as a chessboard's."""
+    phase = saddles.phase[lattice.blobs]
+    for shear in SHEARS:
+        nodes = lattice.nodes @ shear.T
+        if abs(np.exp(1j * phase) @ (1 - 2 * (nodes.sum(1) % 2))) > COHERENCE * len(nodes):
+            break
+    else:
+        return None
+    smooth = cv2.GaussianBlur(image.deep, (3, 3), 0).astype(np.float32)
+    pixels = to_full_image(saddles.pixels[lattice.blobs], factor)
+    found: _Corners | None = None
+    for _ in range(COMPLETIONS):
+        try:
+            grid_map = fit_grid_map(nodes.astype(float), pixels, robust=True)
+        except DetectionError:
+            return found
+        low, high = nodes.min(0) - 1, nodes.max(0) + 1
+        if (high - low).max() > MAX_SIDE_NODES:
+            return found
+        around = grid_points(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
+        around = around[grid_map.pitch_px(around * 1.0) > 2]
+        predicted = grid_map.extrapolate(around * 1.0)
+        across, down = jacobians(grid_map.H, around * 1.0).transpose(2, 0, 1)
+        polarity = corner_polarity(image.deep, predicted, across, down)
+        parity = 1 - 2 * (around.sum(1) % 2)
+        fits = polarity * parity * np.sign((polarity * parity).sum()) > 0
+        if np.count_nonzero(fits) < MIN_CORNERS:
+            return found
+        refined, good = refine_corners(image.deep, predicted[fits], around[fits] * 1.0, np.ones(2))
+        off = lengths(refined - predicted[fits])
+        good &= off < NODE_RADIUS * grid_map.pitch_px(around[fits] * 1.0)
+        if np.count_nonzero(good) < MIN_CORNERS:
+            return found
+        good[good] = _is_in_grid(around[fits][good], refined[good])
+        if np.count_nonzero(good) < MIN_CORNERS:
+            return found
+        is_same = len(nodes) == np.count_nonzero(good)
+        nodes, pixels = around[fits][good], refined[good]
+        found = _Corners(smooth, grid_map, nodes, pixels, polarity[fits][good])
+        if is_same:
+            break
+    return found
+
+
+def _is_in_grid(nodes: np.ndarray, pixels: Floats) -> Mask:
+    """Return whether corners at ``nodes`` (n, 2) int and ``pixels`` (n, 2) lie on one smooth map
+    and have two neighbours."""
+    grid_map = fit_grid_map(nodes * 1.0, pixels, robust=True)
+    is_in = is_on_grid(grid_map, grid_map.pitch_px(nodes * 1.0))
+    neighbours = scipy.spatial.cKDTree(nodes[is_in]).query_ball_point(
+        nodes, 1.01, return_length=True
+    )
+    return np.asarray(is_in & (neighbours > 2))  # itself is one
 
 
 def corner_polarity(image: np.ndarray, corners: Floats, across: Floats, down: Floats) -> np.ndarray:

@@ -74,13 +74,13 @@ def select_numbering_by_mark(
 ) -> np.ndarray | None:
     """Select the one of several valid numberings whose first circle has the mark next to it.
 
-    ``image`` (h, w) float32; ``centres`` (m, 2) px; ``numberings``: (n,) indices into them. None
-    where no numbering, or more than one, has a mark.
+    ``image`` (h, w) float32; ``centres`` (m, 2) px; ``numberings``: (n,) indices into them, -1 for
+    circles that are hidden. None where no numbering, or more than one, has a mark.
     """
     mark = mark_geometry(board)
     if mark is None:
         return None
-    dots = [_detect_dot(board, mark, image, centres[order]) for order in numberings]
+    dots = [_detect_dot(board, mark, image, centres, order) for order in numberings]
     contrasts = np.array([contrast for contrast, _ in dots])
     best = int(np.argmax(contrasts))
     others = np.delete(contrasts, best)
@@ -98,17 +98,19 @@ def is_mark_mirrored(
     return select_numbering_by_mark(board, image, centres, mirrored) is not None
 
 
-def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: Floats) -> tuple[float, bool]:
+def _detect_dot(
+    board: Board, mark: Mark, image: np.ndarray, centres: Floats, order: np.ndarray
+) -> tuple[float, bool]:
     """Return the contrast at the mark's position over the first circle's, and whether a dot there
-    may be the mark.
-
-    ``pixels`` (n, 2): the circles' centres in the order of ``board.points``.
-    """
-    points = board.points[:, :2]
+    may be the mark; arguments as of ``select_numbering_by_mark``."""
+    if order[0] < 0:
+        return 0.0, False
+    seen = np.flatnonzero(order >= 0)
+    points, pixels = board.points[seen, :2], centres[order[seen]]
     centre = np.array([mark.x, mark.y])
     near = np.argsort(lengths(points - centre))[:PREDICTING_CIRCLES]
     H = fit_homography(points[near], pixels[near])
-    bent = fit_grid_map(board.nodes, pixels).to_image(centre[None] / board.pitches)[0]
+    bent = fit_grid_map(board.nodes[seen], pixels).to_image(centre[None] / board.pitches)[0]
     if not np.linalg.det(jacobians(H, np.stack([centre, points[0]]))).prod() > 0:
         return 0.0, False  # behind the camera
     shift = np.eye(3)

@@ -19,7 +19,7 @@ import numpy as np
 
 from slviewer.errors import DetectionError
 from slviewer.geometry.polynomial import monomials
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.vectors import lengths
 from slviewer.target.board import Board
 
@@ -86,6 +86,12 @@ class GridMap:
         scaled = 2 * (points - self.low) / self.span - 1
         return to_image(self.H, points) + monomials(scaled, self.degree) @ self.coefficients
 
+    def extrapolate(self, points: Floats) -> Floats:
+        """Map as ``to_image`` does, with the distortion of the nearest place within the features'
+        rectangle: a polynomial ends there."""
+        near = np.clip(points, self.low, self.low + self.span)
+        return to_image(self.H, points) + self.to_image(near) - to_image(self.H, near)
+
     def pitch_px(self, points: Floats) -> Floats:
         """Return the pitch (n,) px in the image at points (n, 2) in pitches; 0 behind the
         camera."""
@@ -115,17 +121,32 @@ def fit_grid_map(points: Floats, pixels: Floats, robust: bool = False) -> GridMa
     return GridMap(H, low, span, degree, coefficients, residuals, sigma)
 
 
+def is_on_grid(grid_map: GridMap, pitch: Floats) -> Mask:
+    """Return whether each feature that a map was fitted to is as close to it as the others are,
+    ``pitch`` (n,) px."""
+    limit = MAX_GRID_OFFSET_SIGMAS * grid_map.sigma_px
+    most = np.clip(limit, np.maximum(0.3, 0.01 * pitch), np.maximum(0.5, MAX_GRID_OFFSET * pitch))
+    return np.asarray(lengths(grid_map.residuals) <= most)
+
+
 def select_upright(board: Board, pixels: Floats, numberings: list[np.ndarray]) -> np.ndarray:
-    """Select one of several valid numberings, (n,) indices into ``pixels`` (m, 2), by the rule of
-    this module."""
+    """Select one of several valid numberings, (n,) indices into ``pixels`` (m, 2) and -1 for hidden
+    features, by the rule of this module."""
     preferred = np.array([1.0, 0.0] if len(numberings) == 4 else [2.0, 1.0])
-    return max(numberings, key=lambda order: float(x_direction(board, pixels[order]) @ preferred))
+
+    def agreement(order: np.ndarray) -> float:
+        """Return how far the x axis of a numbering points in the preferred direction."""
+        seen = order >= 0
+        return float(x_direction(board.points[seen], pixels[order[seen]]) @ preferred)
+
+    return max(numberings, key=agreement)
 
 
-def x_direction(board: Board, pixels: Floats) -> Floats:
-    """Return the mean direction (2,) of the board's x axis in the image, a unit vector."""
-    x = board.points[:, 0] - board.points[:, 0].mean()
-    direction = x @ (pixels - pixels.mean(0))
+def x_direction(points: Floats, pixels: Floats) -> Floats:
+    """Return the mean direction (2,) of the board's x axis in the image, a unit vector, by features
+    at ``points`` (n, 2 or 3) of the board and ``pixels`` (n, 2)."""
+    x = points[:, 0]
+    direction = (x - x.mean()) @ (pixels - pixels.mean(0))
     return direction / np.linalg.norm(direction)
 
 
@@ -148,11 +169,7 @@ def check_grid(board: Board, pixels: Floats, ids: np.ndarray, what: str) -> None
     pitch = np.sqrt(np.maximum(areas, 1e-9))
     if (lengths(pixels - to_image(fitted.H, points)) > MAX_BEND * pitch).any():
         raise DetectionError(f"the {what} detected do not lie on a flat grid", advice)
-    off = lengths(fitted.residuals)
-    limit = MAX_GRID_OFFSET_SIGMAS * fitted.sigma_px
-    wrong = off > np.clip(
-        limit, np.maximum(0.3, 0.01 * pitch), np.maximum(0.5, MAX_GRID_OFFSET * pitch)
-    )
+    off, wrong = lengths(fitted.residuals), ~is_on_grid(fitted, pitch)
     if wrong.any():
         worst = int(np.argmax(off / pitch))
         u, v = pixels[worst]

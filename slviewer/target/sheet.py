@@ -10,7 +10,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Mask
 from slviewer.target.board import Board
-from slviewer.target.corners import opencv_board
+from slviewer.target.charuco import opencv_board
 from slviewer.target.mark import OFFSET, PAPER_WIDTH, RADIUS, mark_geometry, neighbour_distance_mm
 
 CIRCLE_SHARE = 0.5

@@ -20,10 +20,12 @@ import numpy as np
 from slviewer.devices.capture import CapturedFrames, capture_with_texture, settle
 from slviewer.devices.protocols import (
     CameraSettings,
+    ImageProjector,
     Rig,
     list_changed_settings,
     list_notes,
     preview_interval,
+    scene_state,
     stated_full_scale,
 )
 from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableError
@@ -35,10 +37,22 @@ from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import CaptureProgress, RigView
 
 STREAM_PREVIEWS_PER_S = 4.0  # the clouds matter more then
+UNSEEN_PREVIEW_S = 5.0
+"""Between previews that nobody sees: by them a lost rig is noticed."""
 _NOT_OPEN = "choose a rig first, and wait until its preview runs"
 LIGHTS = {"white": 255, "grey": 128, "dark": None}
 """What the projector may show between captures, as grey levels; "pattern" is a sequence's first
-frame."""
+frame, "image" an image."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShownImage:
+    """An image (h, w, 3) uint8 RGB for the projector. Equal to itself alone."""
+
+    pixels: np.ndarray
+
+
+Light = tuple[str, PatternSequence | ShownImage | None]
 
 _STREAM = "stream"  # what it shows during a stream
 
@@ -175,16 +189,22 @@ class Acquisition(Service):
         self._requests: deque[_Task] = deque()
         self._wanted: Rig | None = None
         self._settings: CameraSettings | None = None
-        self._light: tuple[str, PatternSequence | None] = ("white", None)
+        self._light: Light = ("white", None)
         self._view = RigView()
         self._stream: Stream | None = None
         self._cancel = False
+        self.is_seen = True
+        """Whether somebody sees the previews: then each is grabbed, unless the camera states that
+        its image is still the same."""
+        self.is_followed = False
+        """Whether each preview is judged, of a still image too, for a hands-free capture."""
         # the thread's own:
         self._rig: Rig | None = None
         self._is_open = False
-        self._next_try = self._next_preview = 0.0
+        self._next_try = self._next_preview = self._grabbed = 0.0
+        self._scene: object = None  # of the latest preview
         self._applied: CameraSettings | None = None
-        self._shown: tuple[str, PatternSequence | None] | None = None
+        self._shown: Light | None = None
         self._buffer: np.ndarray | None = None
 
     def use(self, rig: Rig | None, settings: CameraSettings | None = None, fault: str = "") -> None:
@@ -233,8 +253,8 @@ class Acquisition(Service):
                 self._rig = settled if self._rig is self._wanted else self._rig
                 self._wanted = settled
 
-    def set_light(self, light: str, pattern: PatternSequence | None = None) -> None:
-        """Show one of LIGHTS between captures, or the first frame of `pattern`."""
+    def set_light(self, light: str, pattern: PatternSequence | ShownImage | None = None) -> None:
+        """Show one of LIGHTS between captures, the first frame of a `pattern`, or an image."""
         with self._condition:
             self._light = (light, None if light in LIGHTS else pattern)
             self._next_preview = 0.0
@@ -377,7 +397,9 @@ class Acquisition(Service):
                 elif self._clock() >= self._next_preview:
                     least_s = 1 / self._timing.previews_per_s
                     self._next_preview = self._clock() + max(least_s, preview_interval(rig.camera))
-                    self._grab_preview(rig)
+                    self._prepare_devices(rig)
+                    if self._needs_preview(rig):
+                        self._grab_preview(rig)
             except Exception as error:
                 self._handle_fault(error)
             self._wait_for_work()
@@ -416,6 +438,9 @@ class Acquisition(Service):
             name, pattern = light
             if pattern is None:
                 rig.projector.show_level(LIGHTS.get(name, 255))
+            elif isinstance(pattern, ShownImage):
+                assert isinstance(rig.projector, ImageProjector)
+                rig.projector.show_image(pattern.pixels)
             else:
                 rig.projector.load(pattern)
                 rig.projector.show(0)
@@ -440,9 +465,19 @@ class Acquisition(Service):
             )
             self._update_view(exposure_ms=actual.exposure_ms, gain=actual.gain, notes=notes)
 
+    def _needs_preview(self, rig: Rig) -> bool:
+        """Whether another preview may show somebody something new, or a lost rig."""
+        scene = scene_state(rig.camera)
+        if self.is_followed:
+            return True
+        if scene is not None and scene == self._scene:
+            return False
+        return self.is_seen or self._clock() - self._grabbed >= UNSEEN_PREVIEW_S
+
     def _grab_preview(self, rig: Rig) -> None:
         """Grab one frame (h, w) under the requested light, and offer it as a preview."""
         self._prepare_devices(rig)
+        self._grabbed, self._scene = self._clock(), scene_state(rig.camera)
         width, height = rig.camera.size
         frame = np.empty((height, width), rig.camera.dtype)
         rig.camera.grab(frame)

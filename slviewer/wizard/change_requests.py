@@ -67,7 +67,7 @@ class ChangeRequests(Engine):
             """Add the records."""
             labels = ", ".join(record.label(name) for name, record in found.items())
             removal = self._removal(store, found.kind.kind, list(found))
-            self._add_change(store, f"{verb}: {labels}", removal)
+            self._add_change(store, f"{verb} {labels}", removal)
 
         return add
 

@@ -14,14 +14,23 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeAlias, TypeVar
 
+import numpy as np
+
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.devices.world import SimulatedWorld
-from slviewer.errors import CalibrationRejected, DamagedError, InputError, SessionError
+from slviewer.errors import (
+    CalibrationRejected,
+    DamagedError,
+    InputError,
+    SessionError,
+    SlviewerError,
+)
 from slviewer.pipeline.capture import Space, measure_space, warn_of_captured
 from slviewer.pipeline.edit import step_edits
 from slviewer.pipeline.examination import load_examination, load_or_save_examination
@@ -31,6 +40,7 @@ from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
+from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
 from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.diagnostics import LogKeeper
@@ -189,6 +199,12 @@ def move_step(source: Path, target: Path) -> Step:
     return act
 
 
+def remember_running(store: Session, title: str | None) -> None:
+    """Remember what a session's job computes, None once it has ended, if it can be written."""
+    with suppress(SlviewerError, OSError):
+        store.decide("running", title)
+
+
 READ_ATTEMPTS = 20
 """Snapshots in a row that may meet the session's files in the middle of a change."""
 
@@ -235,6 +251,7 @@ class Engine:
         self._live: LiveScan | None = None  # the last one, whether it runs or not
         self._live_listeners = Listeners[LiveCloud]()
         self._hands_free = HandsFree(timing)
+        self._suggested_at_capture: np.ndarray | None = None  # the pose, T_camera_board (4, 4) mm
         self._history = UndoHistory()
         self._bench: RigSetup | None = None
         self._choice: Choice | None = None
@@ -358,12 +375,15 @@ class Engine:
             else:
                 self._notices.add_failure(title, error)
 
-        self._jobs.submit(
-            title,
-            lambda report: work(Job(store.guarded(report.saving), report, warnings.append)),
-            done,
-            failed=end_failed,
-        )
+        def run(report: Reporter) -> Findings[Any] | WrittenFile | str:
+            """Do the work; the session remembers what runs, for when the program is ended."""
+            remember_running(store, title)
+            try:
+                return work(Job(store.guarded(report.saving), report, warnings.append))
+            finally:
+                remember_running(store, None)
+
+        self._jobs.submit(title, run, done, failed=end_failed)
 
     def _run(
         self,
@@ -465,8 +485,14 @@ class Engine:
         judged = next(poses)
         if judged.observation is None:
             self._warner("target-poses")(f"{capture.name} cannot be used: {judged.refused}")
+        elif judged.note:
+            self._warner("target-poses")(f"{capture.name}: {judged.note}")
 
     # previews
+
+    def _switch_hands_free(self, on: bool) -> None:
+        """Switch hands-free capture on or off."""
+        self._hands_free.is_on = self._acquisition.is_followed = on
 
     def _handle_preview(self, view: PreviewView) -> None:
         """Publish an analysed preview, trigger hands-free capture, and update the brightness
@@ -475,13 +501,29 @@ class Engine:
             view.board, not self._acquisition.idle, time.monotonic()
         )
         now = countdown is not None and countdown <= 0
-        self._preview = view = replace(view, countdown_s=None if now else countdown)
+        self._preview = view = replace(
+            view, countdown_s=None if now else countdown, awaited=self._hands_free.awaited
+        )
         if now:
             self._capture_now()
+        elif self._hands_free.needs_move:
+            self._follow_suggestion()
         brightness = view.brightness if self._acquisition.view().light == "white" else ""
         if brightness != self._shown.brightness:
             self.show(brightness=brightness)
         self._preview_listeners.call(view)
+
+    def _follow_suggestion(self) -> None:
+        """Move the simulated board, which nobody holds, to the pose that is suggested since the
+        last capture."""
+        world, session = self._scene, self._publisher.latest.content
+        suggestion = session.suggestion
+        if world is None or suggestion is None or session.pending_plan or session.enough:
+            return
+        T, before = suggestion.T_camera_board, self._suggested_at_capture
+        if before is None or not np.array_equal(T, before):
+            self._suggested_at_capture = T
+            world.place("board", Pose(T[:3, :3].copy(), T[:3, 3].copy()))
 
     # snapshots
 
@@ -506,6 +548,7 @@ class Engine:
             if world is None
             else WorldView(world.standing, world.pose.matrix, world.turn_deg),
             job=self._jobs.view(),
+            planning_s=self._planner.busy_s,
             notices=self._notices.all(),
             space=space,
             hands_free=self._hands_free.is_on,
@@ -549,15 +592,19 @@ class Engine:
                 self._notices.add("error", fault)
         watch = Watch()
         if session.target:
-            lens = session.plan.lens if session.plan else None
-            watch = Watch(Board.parse(session.target), lens)
+            plan = session.plan
+            lens, image = (plan.lens, plan.image) if plan else (None, None)
+            watch = Watch(Board.parse(session.target), lens, image)
+        is_new_board = watch.board != self._watcher.watch.board
         self._watcher.watch = watch
+        if is_new_board:
+            self._watcher.repeat()
         if session.pending_plan:
             self._planner.request(session.pending_plan)
             return
         reached, self._reached = self._reached, (session.folder, session.enough)
         if session.enough and reached != self._reached and self._hands_free.is_on:
-            self._hands_free.is_on = False
+            self._switch_hands_free(False)
             self._notices.add(
                 "good", "the poses reach the wanted accuracy: hands-free capture has stopped"
             )

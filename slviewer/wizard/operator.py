@@ -101,6 +101,10 @@ class Operator(RigRequests, ResultRequests):
         """Return the latest preview; None until there is one."""
         return self._preview
 
+    def watch_previews(self, seen: bool) -> None:
+        """State whether somebody sees the previews; each is grabbed until this is called."""
+        self._acquisition.is_seen = seen
+
     def subscribe(
         self,
         callback: Callable[[Snapshot], None],
@@ -200,12 +204,14 @@ class Operator(RigRequests, ResultRequests):
     @request("Switching hands-free capture")
     def set_hands_free(self, on: bool) -> None:
         """Capture a pose whenever the board is held still in a new place."""
-        self._hands_free.is_on = on
+        self._switch_hands_free(on)
 
     def _capture_pose(self, retaken: str = "") -> None:
         """Queue the capture of a target pose, in place of the one that is retaken."""
         # first: a capture that fails is not repeated with every preview
         self._hands_free.note_capture()
+        suggestion = self._publisher.latest.content.suggestion
+        self._suggested_at_capture = suggestion.T_camera_board if suggestion else None
         store, target = self._store, self._reader.target()
         name = retaken or self._next_name("pose")
         if not target:
@@ -227,9 +233,11 @@ class Operator(RigRequests, ResultRequests):
         """Raise InputError while the live image shows the board."""
         view, world = self._preview, self._scene
         board = view.board if view else None
-        # what stands before the simulated rig may have been exchanged since the latest image
-        is_there = board is not None and (world is None or world.standing == "board")
-        if board and is_there and time.monotonic() - board.time_s < BOARD_S:
+        if board is None:
+            return
+        # the simulated rig shows another image only where its scene has changed
+        is_there = world.standing == "board" if world else time.monotonic() - board.time_s < BOARD_S
+        if is_there:
             raise InputError(
                 "the board is in view, and would be measured",
                 "take it away, or choose to capture with the board in view",
@@ -269,7 +277,7 @@ class Operator(RigRequests, ResultRequests):
             self._note_change()
             if reel:
                 # the next recording may lack these
-                if self._acquisition.view().light in ("dark", "pattern"):
+                if self._acquisition.view().light in ("dark", "pattern", "image"):
                     self._acquisition.set_light("white")
                 reel.advance()
 

@@ -33,8 +33,10 @@ from slviewer.calibration.next_pose import (
 )
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
+from slviewer.fringe.image_area import Box, ImageArea, combine_areas
 from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import Mask
 from slviewer.target.board import Board
 from slviewer.wizard.service import LatestWorker, log
 
@@ -45,12 +47,14 @@ class PoseFeatures:
     px.
 
     `noise_px`: noise of the projector's coordinates on bright places, px (NaN: unknown).
+    `area`: the part of the camera's image that changed between the pose's frames (None: unknown).
     """
 
     points: np.ndarray
     camera: np.ndarray
     projector: np.ndarray
     noise_px: float = np.nan
+    area: ImageArea | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +99,44 @@ class PlanInput:
         coverage alone."""
         return self.calibrated is not None or len(self.features) >= MIN_POSES_FOR_RIG
 
+    @cached_property
+    def area(self) -> ImageArea | None:
+        """The part of the camera's image that changes; None for the whole image."""
+        return combine_areas([f.area for f in self.features.values()])
+
+    @cached_property
+    def box(self) -> Box | None:
+        """Box around the part of the camera's image that changes; None for the whole image."""
+        area = self.area
+        return None if area is None or area.bounds == (0, 0, *area.size) else area.bounds
+
+    def crop(self, box: Box) -> "PlanInput":
+        """Return the input as of a camera that has only a box of its image."""
+        features = {
+            name: replace(f, camera=f.camera - np.array(box[:2]), area=None)
+            for name, f in self.features.items()
+        }
+        stereo = self.calibrated
+        if stereo is not None:
+            camera = _move_lens(stereo.rig.camera, box)
+            stereo = replace(stereo, rig=replace(stereo.rig, camera=camera))
+        size = box[2] - box[0], box[3] - box[1]
+        return replace(self, camera=size, features=features, stereo=stereo)
+
     def initial_lens(self) -> Lens:
         """Return the nominal lens, else one estimated from the features."""
         if self.focal_px is not None:
             return nominal_lens(self.camera, self.focal_px)
         poses = self.features.values()
         return estimated_lens([f.points for f in poses], [f.camera for f in poses], self.camera)
+
+
+def _move_lens(lens: Lens, box: Box) -> Lens:
+    """Return the lens of a camera that has only a box of its image, the box in pixels of the
+    lens's own image."""
+    K = lens.K.copy()
+    K[:2, 2] -= box[:2]
+    return replace(lens, K=K, size=(box[2] - box[0], box[3] - box[1]))
 
 
 USUAL_SIGMA = 4e-5
@@ -118,7 +154,8 @@ class PosePlan:
 
     ``sigma_mm``: the 3D standard deviation that a calibration from these poses is predicted to have
     over the working volume (RMS), None before the rig is known well enough; ``sigma_next_mm``: with
-    the suggested pose added. ``usual_mm``: the default of the wanted sigma.
+    the suggested pose added. ``usual_mm``: the default of the wanted sigma. ``image`` (h, w) bool:
+    the part of the camera's image that changes; None for the whole image.
     """
 
     lens: Lens
@@ -128,6 +165,7 @@ class PosePlan:
     usual_mm: float
     sigma_mm: float | None = None
     sigma_next_mm: float | None = None
+    image: Mask | None = None
 
     def reaches(self, wanted_mm: float) -> bool:
         """Whether the predicted sigma is at most `wanted_mm` and there are at least `MIN_POSES`
@@ -138,12 +176,27 @@ class PosePlan:
             and len(self.poses) >= MIN_POSES
         )
 
+    def uncrop(self, box: Box, area: ImageArea) -> "PosePlan":
+        """Return the plan of a camera's box, in pixels of its whole image, of which ``area``
+        changes."""
+        size = area.size
+        suggestion = self.suggestion
+        if suggestion is not None:
+            outline = suggestion.outline_px + np.array(box[:2])
+            suggestion = replace(suggestion, outline_px=outline)
+        whole = -box[0], -box[1], size[0] - box[0], size[1] - box[1]
+        lens = _move_lens(self.lens, whole)
+        return replace(self, lens=lens, suggestion=suggestion, image=area.image)
+
 
 def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
     """Plan the next pose by information gain, from ``trials`` drawn candidates.
 
-    The rig is the calibrated one, else one estimated from the poses.
+    The rig is the calibrated one, else one estimated from the poses. Of the camera's image counts
+    the box that changes.
     """
+    if given.box and given.area:
+        return plan_next_pose(given.crop(given.box), trials).uncrop(given.box, given.area)
     poses = list(given.features.values())
     if given.calibrated:
         rig, known = given.calibrated.rig, given.calibrated.poses
@@ -183,6 +236,10 @@ def quick_plan(given: PlanInput, before: PosePlan | None) -> PosePlan:
     Poses come from the calibration, else from the lens of the plan `before`, else from the initial
     lens.
     """
+    if given.box and given.area:
+        if before:
+            before = replace(before, lens=_move_lens(before.lens, given.box))
+        return quick_plan(given.crop(given.box), before).uncrop(given.box, given.area)
     if given.calibrated:
         return _plan_by_coverage(given, given.calibrated.rig.camera, given.calibrated.poses)
     if before:
@@ -202,7 +259,14 @@ def _plan_by_coverage(
             poses[name] = T
     placed = list(poses.values())
     usual_mm = USUAL_SIGMA * float(np.mean(depth_range(given.board, lens)))
-    by_coverage = PosePlan(lens, poses, count_coverage(given.board, lens, placed), None, usual_mm)
+    by_coverage = PosePlan(
+        lens,
+        poses,
+        count_coverage(given.board, lens, placed),
+        None,
+        usual_mm,
+        image=given.area.image if given.area else None,
+    )
     if not suggests:
         return by_coverage
     reached = None

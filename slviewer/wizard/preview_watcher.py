@@ -5,6 +5,7 @@ is none. Frames that arrive while a thread is busy replace one another, so that 
 the one analysed next.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,8 +17,9 @@ from slviewer.calibration.next_pose import approximate_pose
 from slviewer.errors import DetectionError
 from slviewer.fringe.layout import image_white, to_eight_bits
 from slviewer.geometry.lens import Lens
-from slviewer.target.board import Board
-from slviewer.target.detect import Detection, detect
+from slviewer.geometry.rigid import Mask
+from slviewer.target.board import Board, Detection
+from slviewer.target.detect import detect
 from slviewer.target.planar import fit_homography, to_image
 from slviewer.wizard.service import LatestWorker, Timing
 from slviewer.wizard.snapshot import BoardSeen, PreviewView
@@ -37,10 +39,12 @@ _REST = 2.0  # pause after a detection, as a multiple of its duration: a third o
 
 @dataclass(frozen=True)
 class Watch:
-    """What to detect in previews: no board where None; `lens` gives its approximate pose."""
+    """What to detect in previews: no board where None; `lens` gives its approximate pose; `image`
+    (h, w) bool: the pixels whose brightness counts, all if None."""
 
     board: Board | None = None
     lens: Lens | None = None
+    image: Mask | None = None
 
 
 class Watcher:
@@ -55,6 +59,7 @@ class Watcher:
         self._searched: tuple[Board | None, np.ndarray] = (None, np.zeros((0, 0), np.uint8))
         self._detected: tuple[Detection | None, str] = (None, "")
         self._number, self._rate, self._last = 0, 0.0, 0.0
+        self._frame: np.ndarray | None = None  # the latest
         self._detector = LatestWorker("slviewer board detection", self._detect, _REST)
         self._viewer = LatestWorker("slviewer preview", self._make_preview)
 
@@ -67,6 +72,10 @@ class Watcher:
         """Analyse `frame` (h, w) next, instead of any that is still waiting; `full_scale` is what
         the camera states, `second` a second camera's frame, to be shown with it."""
         self._viewer.offer((frame, full_scale, second))
+
+    def repeat(self) -> None:
+        """Analyse the latest frame once more: another board is to be detected."""
+        self._viewer.repeat()
 
     def close(self) -> None:
         """End both threads."""
@@ -85,15 +94,16 @@ class Watcher:
         white = image_white(frame, full_scale)
         if self.watch.board:
             self._detector.offer((image, scale, now))
-        if self._last:
-            self._rate += 0.2 * (1 / max(now - self._last, 1e-3) - self._rate)
-        self._last = now
+        if frame is not self._frame:  # repeated for what has changed besides
+            if self._last:
+                self._rate += 0.2 * (1 / max(now - self._last, 1e-3) - self._rate)
+            self._last, self._frame = now, frame
         self._number += 1
         watch, board, missing = self._result
         if watch.board != self.watch.board:
             board, missing = None, ""
         rate = round(self._rate, 1)
-        light = brightness(frame, white)
+        light = brightness(frame, white, self.watch.image)
         level = to_eight_bits(np.array([[white]], frame.dtype), full_scale, int(frame.max()))
         image = np.where(image < level, image, np.uint8(255))
         beside = None if second is None else reduced(second, full_scale=full_scale)[0]
@@ -104,17 +114,19 @@ class Watcher:
         """Detect the board in (reduced image, its scale, time in s), and store it, or why there is
         none.
 
-        An image in which nothing has moved is not searched again.
+        An image in which nothing has moved is not searched again. What is detected is published
+        with the same frame once more, as another one may not come.
         """
         image, scale, time_s = item
         watch, board = self.watch, None
         thumbnail = reduced(image, _THUMBNAIL_PX)[0]
         board_before, before = self._searched
-        if (
+        is_searched = (
             board_before != watch.board
             or before.shape != thumbnail.shape
             or float(np.percentile(cv2.absdiff(thumbnail, before), 99)) >= _UNCHANGED
-        ):
+        )
+        if is_searched:
             self._searched = watch.board, thumbnail
             self._detected = detect_in_preview(watch.board, image)
         detection, missing = self._detected
@@ -133,6 +145,8 @@ class Watcher:
         else:
             self._stillness.reset()
         self._result = (watch, board, missing)
+        if is_searched:
+            self.repeat()
 
 
 class Stillness:
@@ -173,11 +187,17 @@ def reduced(
     return to_eight_bits(small, full_scale, int(frame.max(initial=0))), scale
 
 
-def brightness(frame: np.ndarray, white: float | None = None) -> tuple[float, float, np.ndarray]:
+def brightness(
+    frame: np.ndarray, white: float | None = None, image: Mask | None = None
+) -> tuple[float, float, np.ndarray]:
     """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,)
-    of shares); ``white``: level at which the camera clips, by default that of the frame."""
+    of shares); ``white``: level at which the camera clips, by default that of the frame; ``image``
+    (h, w) bool: the pixels that count, all if None."""
     white = image_white(frame) if white is None else white
-    some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
+    sample = np.s_[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
+    some = frame[sample]
+    if image is not None and image.shape == frame.shape and image[sample].any():
+        some = some[image[sample]]
     some = np.minimum(some, int(white))
     brightest = float(np.percentile(some, 99.5, method="inverted_cdf"))
     shares = np.histogram(some, BINS, (0, white + 1))[0] / some.size
@@ -190,9 +210,14 @@ def detect_in_preview(board: Board | None, image: np.ndarray) -> tuple[Detection
     if board is None:
         return None, ""
     try:
-        return detect(board, image), ""
+        return detect(board, image, several=True), ""  # as calibrations do
     except DetectionError as error:
         return None, str(error)
+
+
+SHOW = "Hands-free waits for the board: hold it in view of the camera."
+MOVE = "Hands-free waits: move the board to the dashed outline, then hold it still."
+HOLD = "Hands-free waits: hold the board still."
 
 
 class HandsFree:
@@ -202,31 +227,53 @@ class HandsFree:
     def __init__(self, timing: Timing) -> None:
         self._timing = timing
         self.is_on = False
+        self.awaited = ""
+        """What it waits for before it captures; empty while it is off, and while anything is
+        captured."""
         self._captured: np.ndarray | None = None  # the board's outline at the last capture
-        self._requested: float | None = (
-            None  # when the last capture was, until the board is detected after it
-        )
+        self._requested = -math.inf  # when the last capture was
+        self._is_place_unknown = False  # of the last capture, until the board is detected after it
+        self._due: np.ndarray | None = None  # the outline at which a capture is due
         self._begun: float | None = None
+
+    @property
+    def needs_move(self) -> bool:
+        """Whether the board still is where it was captured last."""
+        return self.awaited == MOVE
 
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
         """Return the seconds until the capture, 0 or less when it is due; None where none is
         coming."""
-        if self._requested is not None and not busy and board and board.time_s > self._requested:
-            self._captured, self._requested = board.outline, None
-        held = self.is_on and self._requested is None and board is not None and not busy
-        if not held or board is None or board.still_s < self._timing.hold_s:
-            self._begun = None
+        is_fresh = board is not None and board.time_s > self._requested
+        if self._is_place_unknown and not busy and board and is_fresh:
+            self._captured, self._is_place_unknown = board.outline, False
+        self.awaited = self._find_obstacle(board if is_fresh else None, busy)
+        if self.awaited or busy or not self.is_on or board is None:
+            self._begun = self._due = None
             return None
+        if self._begun is None:
+            self._begun = now
+        remaining_s = self._timing.count_s - (now - self._begun)
+        self._due = board.outline if remaining_s <= 0 else None
+        self.awaited = f"Hold the board still: {max(remaining_s, 0):.1f} s."
+        return remaining_s
+
+    def _find_obstacle(self, board: BoardSeen | None, busy: bool) -> str:
+        """Return what must happen before the countdown; empty where it may run."""
+        if busy or not self.is_on:
+            return ""
+        if board is None:
+            return SHOW
         if self._captured is not None:
             size = np.linalg.norm(np.ptp(board.outline, axis=0))
             if np.abs(board.outline - self._captured).max() < 0.03 * size:  # the same place
-                self._begun = None
-                return None
-        if self._begun is None:
-            self._begun = now
-        return self._timing.count_s - (now - self._begun)
+                return MOVE
+        return "" if board.still_s >= self._timing.hold_s else HOLD
 
     def note_capture(self) -> None:
-        """Note that a capture was requested; the board's outline in the next preview is then the
-        captured place."""
-        self._requested, self._begun = time.monotonic(), None
+        """Note that a capture was requested: its place is where a capture was due, else the board's
+        outline in the next preview."""
+        self._is_place_unknown = self._due is None
+        if self._due is not None:
+            self._captured = self._due
+        self._requested, self._begun, self._due = time.monotonic(), None, None

@@ -13,6 +13,8 @@ from slviewer.wizard.snapshot import Snapshot
 PAUSE_S = 0.05
 """Between two snapshots: a panel needs no more than twenty a second."""
 REFRESH_S = 30.0
+PULSE_S = 1.0
+"""Between two snapshots while a job runs and reports nothing."""
 
 
 class Listeners(Generic[Item]):
@@ -92,6 +94,11 @@ class Publisher(Service):
             self._condition.wait_for(lambda: condition(self.latest) or self._closing, timeout_s)
             return self.latest if condition(self.latest) else None
 
+    def _find_pause_s(self) -> float | None:
+        """Return after how long another snapshot is published without a change: while a job or
+        a plan is computed, its seconds count."""
+        return PULSE_S if self.latest.job or self.latest.content.pending_plan else None
+
     def _serve(self) -> None:
         """Build and publish a snapshot after each batch of changes, or after a failure, until
         closing."""
@@ -99,7 +106,7 @@ class Publisher(Service):
             with self._condition:
                 self._condition.wait_for(
                     lambda: self._requested > self._published or self._closing,
-                    self._retry_s if self.latest.read_failure else None,
+                    self._retry_s if self.latest.read_failure else self._find_pause_s(),
                 )
                 if self._closing:
                     return

@@ -120,6 +120,32 @@ class ResultRequests(ChangeRequests):
         settings = ReconstructSettings(name, model, check=False)
         self._run("Reconstructing", reconstruct, settings, "scans")
 
+    @request("Reconstructing")
+    def reconstruct_all(self) -> None:
+        """Reconstruct every scan that has no up-to-date cloud, with the model in use; one that
+        cannot be reconstructed is named, and the others are."""
+        pending = self._publisher.latest.content.pending_scans
+        if not pending:
+            raise InputError("every scan is reconstructed")
+
+        def work(job: Job) -> str:
+            """Reconstruct one after the other."""
+            accepts, done = accepts_rejected(job.store), 0
+            for k, name in enumerate(pending):
+                settings = ReconstructSettings(name, check=False, accept_rejected=accepts)
+                each = job.part(k / len(pending), (k + 1) / len(pending), name)
+                try:
+                    reconstruct.run(each.store, settings, each.progress, each.warn)
+                    done += 1
+                except Cancelled:
+                    raise
+                except SlviewerError as error:
+                    job.warn(f"{self._label(name)} was not reconstructed: {error}")
+                self._publisher.mark_changed()
+            return f"{done} of {format_count(len(pending), 'scan')} reconstructed"
+
+        self._work("Reconstructing", work, "scans")
+
     @request("Running the operation")
     def run(self, operation: str, **settings: Any) -> None:
         """Run any operation by the name of its command, with its settings."""
@@ -195,7 +221,7 @@ class ResultRequests(ChangeRequests):
                 words = "no watertight mesh was made"
                 job.warn(f"{words}: {error}")
             job.progress(1.0, "merged")
-            worst = max(pair.rms_mm for pair in merged.pairs.values())
+            worst = max(pair.rms_mm or 0.0 for pair in merged.pairs.values())
             return (
                 f"{len(merged.scans)} scans merged on {merged.reference}, RMS up to {worst:.3f} mm;"
                 f" {words}"

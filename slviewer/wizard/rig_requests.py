@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from slviewer.devices.capture import check_exposures
-from slviewer.devices.protocols import CameraSettings, Rig
+from slviewer.devices.protocols import CameraSettings, ImageProjector, Rig, check_image
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import DamagedError, DeviceError, InputError, SlviewerError
 from slviewer.fringe.presets import find_preset
@@ -28,8 +28,8 @@ from slviewer.session.recent import unused_folder
 from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
-from slviewer.wizard.acquisition import LIGHTS
-from slviewer.wizard.engine import Engine, request
+from slviewer.wizard.acquisition import LIGHTS, ShownImage
+from slviewer.wizard.engine import Engine, remember_running, request
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import CalibrationView, ExposureChange, Level
 
@@ -82,6 +82,13 @@ class RigRequests(Engine):
                 self._notices.add(
                     "info",
                     f"{name} was complete when the program ended, and is in the session again",
+                )
+            if interrupted := store.valid_decision("running"):
+                remember_running(store, None)
+                self._notices.add(
+                    "warning",
+                    f"{interrupted} was interrupted when the program ended: start it again; what"
+                    " had been saved is there",
                 )
             try:
                 self._restore_rig(store, rig)
@@ -299,6 +306,17 @@ class RigRequests(Engine):
         if light == "dark" and reel and not reel.has_dark:
             raise InputError("the recording has no dark frame", "choose another light")
         self._acquisition.set_light(light, self._pose_sequence() if light == "pattern" else None)
+
+    @request("Showing the image")
+    def show_image(self, image: np.ndarray) -> None:
+        """Show an image (h, w, 3) uint8 RGB with the rig's projector between captures."""
+        projector = self._require_bench().rig.projector
+        if not isinstance(projector, ImageProjector):
+            raise InputError(
+                f"{projector.name} shows patterns alone, by its driver",
+                "show the image's PNG file full screen on the projector, pixel by pixel",
+            )
+        self._acquisition.set_light("image", ShownImage(check_image(projector, image)))
 
     @request("Choosing the target")
     def choose_target(self, notation: str) -> None:

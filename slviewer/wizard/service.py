@@ -73,12 +73,26 @@ class LatestWorker(Service, Generic[Item]):
         super().__init__(name)
         self._work, self._rest = work, rest
         self._item: Item | None = None
+        self._last: Item | None = None
+        self._begun: float | None = None  # of the item in work
         self._thread.start()
 
     def offer(self, item: Item) -> None:
         """Set the next item, in place of one that is still waiting."""
         with self._condition:
             self._item = item
+            self._condition.notify_all()
+
+    @property
+    def busy_s(self) -> float:
+        """For how many seconds it has worked on an item; 0 while it does not."""
+        begun = self._begun
+        return 0.0 if begun is None else time.monotonic() - begun
+
+    def repeat(self) -> None:
+        """Process the last item once more, unless another one is waiting."""
+        with self._condition:
+            self._item = self._last if self._item is None else self._item
             self._condition.notify_all()
 
     def _serve(self) -> None:
@@ -89,13 +103,14 @@ class LatestWorker(Service, Generic[Item]):
                 self._condition.wait_for(lambda: self._closing or self._item is not None)
                 if self._closing:
                     return
-                item, self._item = self._item, None
+                item, self._last, self._item = self._item, self._item, None
             assert item is not None
-            begun = time.monotonic()
+            self._begun = begun = time.monotonic()
             try:
                 self._work(item)
             except Exception:  # one bad item must not end the thread
                 log.exception("%s failed", threading.current_thread().name)
+            self._begun = None
             with self._condition:
                 self._condition.wait_for(
                     lambda: self._closing, self._rest * (time.monotonic() - begun)

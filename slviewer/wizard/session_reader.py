@@ -15,6 +15,7 @@ from slviewer.calibration.next_pose import count_cells, outline_px
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
 from slviewer.errors import DamagedError, SessionError, SlviewerError
+from slviewer.fringe.image_area import AREA, ImageArea
 from slviewer.fringe.presets import PRESETS
 from slviewer.geometry.vectors import finite_rows
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
@@ -83,7 +84,7 @@ class SessionReader:
         next pose."""
         sigma = observation.samples.sigma if observation.samples else np.zeros(0)
         seen = observation.points, observation.camera, observation.projector
-        self._features[capture.hash, target] = _make_features(*seen, sigma)
+        self._features[capture.hash, target] = _make_features(*seen, sigma, observation.area)
 
     def target(self) -> str:
         """Return the board's notation, empty where it is unknown or a board of a plugin that is not
@@ -287,10 +288,13 @@ class SessionReader:
         key = pose.hash, target
         if key not in self._features:
             # older versions saved no samples
-            names = {"points", "camera", "projector", "samples_sigma"} & set(meta["arrays"])
+            wanted = {"points", "camera", "projector", "samples_sigma"}
+            names = {each for each in meta["arrays"] if each in wanted or each.startswith(AREA)}
             arrays = self.session.load_result(f"poses/{pose.name}", only=names)[1]
-            sigma = arrays.pop("samples_sigma", np.zeros(0))
-            self._features[key] = _make_features(**arrays, sigma=sigma)
+            sigma = arrays.get("samples_sigma", np.zeros(0))
+            area = ImageArea.from_arrays(arrays)
+            seen = {each: arrays[each] for each in ("points", "camera", "projector")}
+            self._features[key] = _make_features(**seen, sigma=sigma, area=area)
         return self._features[key]
 
     # calibration
@@ -387,14 +391,17 @@ class SessionReader:
 
 
 def _make_features(
-    points: np.ndarray, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray
+    points: np.ndarray,
+    camera: np.ndarray,
+    projector: np.ndarray,
+    sigma: np.ndarray,
+    area: ImageArea | None,
 ) -> PoseFeatures:
     """Return features (n, 3) mm, (n, 2) and (n, 2) px, with the median of their samples' standard
-    deviations, px."""
+    deviations, px, and the ``area`` of the camera's image."""
     known = sigma[np.isfinite(sigma)]
-    return PoseFeatures(
-        points, camera, projector, float(np.median(known)) if known.size else np.nan
-    )
+    noise_px = float(np.median(known)) if known.size else np.nan
+    return PoseFeatures(points, camera, projector, noise_px, area)
 
 
 def _cover_second(plan: PosePlan | None, given: PlanInput | None) -> PosePlan | None:
@@ -472,7 +479,8 @@ def _read(session: Session, changed: datetime) -> SessionOverview:
     with suppress(SlviewerError):
         verdict = load_last_verdict(session)
     picture = b""
-    for capture in sorted(captures, key=lambda each: each.purpose == "scan", reverse=True):
+    with_frames = [each for each in captures if not each.is_imported_cloud]
+    for capture in sorted(with_frames, key=lambda each: each.purpose == "scan", reverse=True):
         with suppress(SlviewerError):
             picture = make_thumbnail(capture)
             break

@@ -217,6 +217,15 @@ class ScanView:
     undone_edits: int = 0  # which can be redone
 
     @property
+    def shape(self) -> str:
+        """The capture's purpose: "scan", of an object, "plane" or "sphere"; of a recorded one also
+        what its name suggests."""
+        if self.purpose != "scan":
+            return self.purpose
+        named = (each for each in ("plane", "sphere") if self.name.lower().startswith(each))
+        return next(named, "scan")
+
+    @property
     def is_placed(self) -> bool:
         """Whether the scan is in its place beside others."""
         return self.placement is not None and self.placement.is_good
@@ -305,6 +314,12 @@ class SessionView:
         """Number of poses that a calibration can use."""
         return sum(pose.state in ("good", "used", "unused") for pose in self.poses)
 
+    @property
+    def pending_scans(self) -> tuple[str, ...]:
+        """Names of the scans of objects that have no up-to-date cloud."""
+        scans = (scan for scan in self.scans if scan.shape == "scan")
+        return tuple(scan.name for scan in scans if scan.cloud != "fresh")
+
     def list_records(self, kind: type[R]) -> list[Stored[R]]:
         """Return the session's records of a kind."""
         return [each for each in self.records if isinstance(each.record, kind)]
@@ -383,6 +398,7 @@ class Snapshot:
     brightness: Brightness = ""  # of the camera's image in white light
     next_undo: str = ""  # what was done last and can be undone; empty where nothing can
     next_redo: str = ""  # what was undone last
+    planning_s: float = 0.0  # for so long the next pose has been computed
 
     @property
     def is_busy(self) -> bool:
@@ -449,6 +465,7 @@ class PreviewView:
     missing: str
     countdown_s: float | None
     frames_per_s: float
+    awaited: str = ""  # what hands-free capture waits for
     second: np.ndarray | None = None
 
     @property

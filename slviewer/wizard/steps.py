@@ -42,9 +42,66 @@ def views(now: Snapshot) -> tuple[StepView, ...]:
     return tuple(made)
 
 
+def list_activities(now: Snapshot) -> list[tuple[str, float | None]]:
+    """List what runs, for the line of state, each with the share done, None where it is not
+    known."""
+    job, capture, found = now.job, now.rig.capture, list[tuple[str, float | None]]()
+    if capture:
+        waiting = f", {capture.waiting} waiting" if capture.waiting else ""
+        text = f"Capturing {capture.name}: frame {capture.frame} of {capture.frames}{waiting}"
+        if capture.stage:
+            text = f"{capture.name}: {capture.stage}{waiting}"
+        found.append((text, capture.frame / max(capture.frames, 1)))
+    if job:
+        waiting = f", {job.waiting} waiting" if job.waiting else ""
+        stage = f": {job.stage}" if job.stage else ""
+        found.append((f"{job.name}{stage}{waiting} ({job.seconds:.0f} s)", job.share))
+    if now.content.pending_plan:
+        seconds = f" ({now.planning_s:.0f} s)"
+        found.append((f"Computing the next pose, for which Place board waits{seconds}", None))
+    if now.preparing is not None:
+        text = f"Compiling for this computer, once, {100 * now.preparing:.0f} %"
+        found.append((f"{text}: the first pose and calibration wait for it", now.preparing))
+    return found
+
+
+def describe_awaited(now: Snapshot, key: str, hands_free: str = "") -> str:
+    """Return what a step waits for, for the line of state, and so why its buttons are grey.
+    `hands_free`: what that capture waits for."""
+    rig, step = now.rig, now.step(key)
+    if rig.capture or now.is_busy:
+        return "Buttons that start other work are grey until it ends."
+    if step.blocked_by:
+        return step.blocked_by
+    if key in ("poses", "verify", "scan") and rig.state != "open":
+        return _RIG_AWAITED[rig.state]
+    if key == "poses" and now.hands_free:
+        return hands_free
+    return f"Waits for you: {_ACTIONS[key]}."
+
+
+_RIG_AWAITED = {
+    "none": "Captures wait for a rig: choose one in the step Rig.",
+    "opening": "Captures wait for the rig: it is being opened.",
+    "lost": "Captures wait for the rig: its connection is tried every two seconds.",
+}
+_ACTIONS = {
+    "rig": "choose and check the rig",
+    "target": "choose the board, and use it",
+    "poses": "hold the board still, and press Capture pose (key C)",
+    "calibrate": "press Calibrate, or look at the result",
+    "verify": "put a plate or a sphere in view and capture it, or continue to Scan",
+    "scan": "put the object in view, and press Capture scan",
+    "merge": "choose the scans, and press Merge",
+    "measure": "choose a tool, and click on the surface",
+    "export": "choose what to write",
+}
+"""{step: what the operator does next in it}."""
+
+
 def _count_scans(now: Snapshot) -> int:
     """Return the number of scans with an up-to-date cloud."""
-    return sum(scan.purpose == "scan" and scan.cloud == "fresh" for scan in now.content.scans)
+    return sum(scan.shape == "scan" and scan.cloud == "fresh" for scan in now.content.scans)
 
 
 def _no_session(now: Snapshot) -> str:
@@ -161,7 +218,10 @@ def _describe_enough(session: SessionView) -> str:
 
 def _describe_next_pose(now: Snapshot) -> str:
     """Return where to hold the board next."""
-    session, number = now.content, now.content.good_poses + 1
+    session, capture = now.content, now.rig.capture
+    number = 1 + session.good_poses + sum(pose.state == "judging" for pose in session.poses)
+    if capture and capture.name.startswith("pose_"):
+        number += now.pose(capture.name) is None
     if now.session is None:
         cameras = "both cameras" if now.rig.second else "camera"
         return f"Hold the board in view of {cameras} and projector."
@@ -234,7 +294,13 @@ def _verify(now: Snapshot) -> Outlook:
 def _scan(now: Snapshot) -> Outlook:
     """There is a scan with an up-to-date cloud; clouds of an older calibration are problems."""
     scans, instruction = _count_scans(now), "Put the object in view, and capture it."
-    if scans:
+    pending = len(now.content.pending_scans)
+    if pending and not now.is_busy:
+        instruction = (
+            f"{format_count(scans + pending, 'scan')}, {scans or 'none'} reconstructed: reconstruct"
+            " the others, or capture more."
+        )
+    elif scans:
         instruction = (
             f"{format_count(scans, 'scan')}: turn or move the object for another, or merge"
             " them next."
@@ -263,7 +329,13 @@ def _merge(now: Snapshot) -> Outlook:
     if done:
         instruction = "Check the alignment; undo the merge if it is wrong, or measure next."
     if merge is None:
-        if not blocked and _count_scans(now) < 2:
+        scans, pending = _count_scans(now), len(now.content.pending_scans)
+        if not blocked and scans < 2 <= scans + pending:
+            blocked = (
+                f"Merging needs at least two reconstructed scans: of {scans + pending} scans"
+                f" {scans or 'none'} {'are' if scans != 1 else 'is'}. Reconstruct the others."
+            )
+        elif not blocked and scans < 2:
             blocked = (
                 "Merging needs at least two scans of one object: scan it again from another side."
             )
@@ -274,7 +346,7 @@ def _merge(now: Snapshot) -> Outlook:
         f"{name} overlaps by only {100 * pair.overlap:.0f} % (RMS {pair.rms_mm:.2f} mm): "
         "scan with more overlap."
         for name, pair in merge.record.pairs.items()
-        if pair.overlap < MIN_OVERLAP
+        if pair.rms_mm is not None and pair.overlap < MIN_OVERLAP
     ]
     return blocked, done, instruction, problems
 

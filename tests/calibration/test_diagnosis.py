@@ -91,6 +91,23 @@ def test_a_sound_calibration_is_good() -> None:
 
 
 @pytest.mark.computes
+def test_a_corner_that_no_pose_reaches_is_named() -> None:
+    width, height = TRUE.camera.size
+    lit = np.ones((height, width), bool)
+    lit[: height // 3, -width // 3 :] = False
+    away = []
+    for o in observations(8):
+        u0, v0, u1, v1 = o.box
+        box = (u0, v0, u1 - (u1 - u0) // 2 * (o.name == "pose_07"), v1)  # the last sees a half
+        lit_here = np.packbits(lit[v0:v1, u0 : box[2]])
+        away.append(dataclasses.replace(o, box=box, packed_region=lit_here))
+    assert attempt(observations(8)).verdict.causes == ()
+    found = attempt(away)
+    assert found.verdict.causes == ("empty-corner",)
+    assert found.evidence.solution.empty_corners == ("top right",)
+
+
+@pytest.mark.computes
 def test_cells_that_are_not_square_are_named() -> None:
     scaled = np.array([1, 1 / 0.7, 1])
     poses = [dataclasses.replace(o, points=o.points * scaled) for o in observations(8)]

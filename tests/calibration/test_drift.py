@@ -16,7 +16,7 @@ from slviewer.calibration.drift import (
     build_reference,
     check_drift,
 )
-from slviewer.calibration.stereo import calibrate_stereo
+from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.records.acceptance import Drift
 from slviewer.records.record import from_plain, render_text, to_plain
@@ -34,22 +34,36 @@ def later() -> list[Pose]:
     return poses(RIG, 20, seed=77)
 
 
+def view(rig, pose, name, **how) -> DriftView:
+    return DriftView.from_observation(seen(rig, pose, name, **how))
+
+
+def build(rig, count, seed) -> tuple[StereoModel, DriftReference]:
+    observations = [seen(rig, pose, f"pose_{i}") for i, pose in enumerate(poses(rig, count, seed))]
+    model = calibrate_stereo(observations, rig.projector.size, str(BOARD))
+    views = [DriftView.from_observation(o) for o in observations if o.name in model.poses]
+    return model, build_reference(model.rig, views)
+
+
 @pytest.fixture(scope="module")
 def reference():
-    observations = [seen(RIG, pose, f"pose_{i}") for i, pose in enumerate(poses(RIG, 12, seed=3))]
-    model = calibrate_stereo(observations, RIG.projector.size, str(BOARD))
-    found = build_reference(
-        model.rig, [DriftView.from_observation(o) for o in observations if o.name in model.poses]
-    )
+    model, found = build(RIG, 12, seed=3)
     kept = DriftReference.from_arrays(model.rig, found.to_arrays())  # as a session keeps it
     assert np.array_equal(kept.sigmas, found.sigmas)
     return kept
 
 
 def checked(reference, rig, i, name="later", **how) -> Drift:
-    return check_drift(
-        reference, DriftView.from_observation(seen(rig, later()[i], f"{name}_{i}", **how))
-    )
+    return check_drift(reference, view(rig, later()[i], f"{name}_{i}", **how))
+
+
+@pytest.mark.parametrize("seed", [11, 21])
+def test_few_poses_raise_no_false_alarm(seed):
+    """Their own scatter may be explained by one kind of observations without any error."""
+    rig = letter(0.25, seed=seed)
+    _, found = build(rig, 8, seed)
+    later = [check_drift(found, view(rig, pose, "later")) for pose in poses(rig, 10, seed=77)]
+    assert [d.verdict for d in later] == ["still good"] * 10
 
 
 def test_an_unmoved_rig_raises_no_alarm(reference):

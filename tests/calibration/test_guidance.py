@@ -15,8 +15,15 @@ from slviewer.calibration.guidance import (
     volume_jacobian,
 )
 from slviewer.calibration.next_pose import depth_range
+from slviewer.fringe.image_area import ImageArea
 from slviewer.geometry.rig import StereoRig
-from slviewer.wizard.pose_plan import MIN_POSES, PlanInput, PoseFeatures, plan_next_pose
+from slviewer.wizard.pose_plan import (
+    MIN_POSES,
+    PlanInput,
+    PoseFeatures,
+    plan_next_pose,
+    quick_plan,
+)
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +120,32 @@ def test_noise_that_was_seen_is_expected() -> None:
     assert noisy.sample == pytest.approx(3 * usual.sample) and noisy.feature == pytest.approx(
         3 * usual.feature
     )
+
+
+def test_a_plan_is_of_the_part_of_the_image_that_changes(true, seen) -> None:
+    sizes = true.camera.size, true.projector.size
+    (width, height), left, right = sizes[0], 60, 40
+    size = left + width + right, height
+    u = np.tile(np.arange(size[0]), (height, 1))
+    area = ImageArea.of((u < left) | (u >= left + width))
+    plain, barred = (
+        {f"pose_{i}": PoseFeatures(p, c + dx, q, area=part) for i, (p, c, q) in enumerate(seen[:4])}
+        for dx, part in ((np.zeros(2), None), (np.array([left, 0.0]), area))
+    )
+    whole = quick_plan(PlanInput(BOARD, *sizes, plain), None)
+    plan = quick_plan(PlanInput(BOARD, size, sizes[1], barred), None)
+    assert np.array_equal(plan.coverage.cells, whole.coverage.cells)
+    assert plan.coverage.share == whole.coverage.share
+    assert plan.lens.size == size
+    assert plan.lens.K[:2, 2] == pytest.approx(whole.lens.K[:2, 2] + np.array([left, 0]))
+    assert plan.suggestion is not None and whole.suggestion is not None
+    assert plan.suggestion.sentence == whole.suggestion.sentence
+    assert plan.suggestion.outline_px == pytest.approx(
+        whole.suggestion.outline_px + np.array([left, 0])
+    )
+    again = quick_plan(PlanInput(BOARD, size, sizes[1], barred), plan)
+    assert again.suggestion is not None
+    assert again.suggestion.outline_px == pytest.approx(plan.suggestion.outline_px)
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ def evidence(
 
 
 def ripple(rms_px: float, waves: int, noise_px: float = 0.1) -> Ripple:
-    return Ripple(rms_px, waves, rms_px, noise_px, mm_per_px=1.6, depth_mm=600.0)
+    return Ripple(rms_px, waves, noise_px, mm_per_px=1.6, depth_mm=600.0)
 
 
 def test_as_many_waves_as_steps_are_gamma_and_few_are_changing_light(solution) -> None:

@@ -172,6 +172,11 @@ def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: P
     assert len(trimesh.load(ply).vertices) > 10_000
     status, text, _ = run("measure", session, "merge/1", "distance", "--at", 0, 5000)
     assert status == 0 and not missing_facts(text, "distance", "merge/1")
+    for k, named in enumerate(
+        (["merge/1"], ["merge", 1], ["merge", "merge/1"], ["cloud", "merge/1"])
+    ):
+        assert run("export", session, *named, "--out", tmp_path / f"same_{k}.ply")[0] == 0, named
+    assert len({path.read_bytes() for path in tmp_path.glob("same_*.ply")}) == 1
     status, text, _ = run("export", session, "merge", "--out", tmp_path / "all.xyz")
     assert status == 0 and len(np.loadtxt(tmp_path / "all.xyz")) == merged["points"]
 

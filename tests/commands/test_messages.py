@@ -32,7 +32,17 @@ from slviewer.session.toml import describe_sequence
 FILES = sorted((Path(__file__).parent / "messages").glob("*.txt"))
 WITHOUT_SITUATIONS = {"devices", "plugins"}
 """They take no arguments; tests/docs/test_example_plugin.py lists broken plugins."""
-COMPUTING = {"accept", "calibrate", "check", "decode", "import", "merge", "reconstruct", "verify"}
+COMPUTING = {
+    "accept",
+    "calibrate",
+    "check",
+    "decode",
+    "import",
+    "merge",
+    "reconstruct",
+    "show-on-part",
+    "verify",
+}
 """Their situations decode or fit, for which kernels are compiled."""
 CAMERA, PROJECTOR, FOCAL_PX, SHIFT_PX, BASELINE_MM = (96, 64), (128, 64), 120.0, 8, 40.0
 SPHERE = """kind = "sphere"

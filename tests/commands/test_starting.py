@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from slviewer.cli import find_commands, main
-from slviewer.commands.command import _Module
+from slviewer.commands.command import _SourceModule
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.rig import letter
 from slviewer.validation.bench_scaling import save_scans
@@ -61,6 +62,45 @@ def test_a_command_has_the_arguments_that_its_functions_docstring_describes(
     )
 
 
+@pytest.mark.parametrize("command", [[name] for name in find_commands()] + [["import", "frames"]])
+def test_help_shows_values_and_defaults_of_the_terminal_only(
+    command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command, "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert not re.search(r"None\b|\bRaises |\bReturns the|[a-z]Error\b|``|default: ('')?\)", text)
+    assert "(default: False)" not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["export", "session", "--fromat", "stl"], "--format"),
+        (["mesh", "session", "part", "--methd=grid"], "--method"),
+        (["import", "p18", "--projectr", "9x9", "folder"], "--projector"),
+        (["wizard", "--prot", "80"], "--port"),
+        (["calibrate", "session", "--tartget", "circles:3x4:5"], "--target"),
+    ],
+)
+def test_a_misspelt_option_is_named_and_not_what_it_displaced(
+    arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    assert f"did you mean {meant}?" in capsys.readouterr().err
+
+
+def test_a_value_of_the_wrong_type_is_refused_by_that_type_only(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["mesh", "session", "part", "--triangles", "many"]) == 2
+    text = capsys.readouterr().err
+    assert "--triangles" in text and "many" in text and "None" not in text
+    assert "whole number" in text and "literal" not in text
+    assert main(["simulate", "session", "--scale", "0,5"]) == 2
+    text = capsys.readouterr().err
+    assert "--scale" in text and "0.5" in text and "convert" not in text
+
+
 @pytest.mark.parametrize("command", ["export", "mesh"])
 def test_help_says_that_extrapolated_points_are_omitted(
     command: str, capsys: pytest.CaptureFixture[str]
@@ -95,7 +135,7 @@ WIDTH: int = 4
 '''
     (tmp_path / "made_up_module.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
-    module = _Module("made_up_module")
+    module = _SourceModule("made_up_module")
     assert module["WIDTH"] == 4 and module["TEXT"] == "\ndef other(:\n"
     assert module.find_node("NAME") is None
     definition = module.find_node("last")

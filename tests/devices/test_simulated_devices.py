@@ -14,6 +14,7 @@ from slviewer.devices.simulated import AUTO, preset_rig, simulated_rig
 from slviewer.devices.world import SETTLED_S, SimulatedWorld
 from slviewer.errors import Cancelled, DeviceError, InputError
 from slviewer.fringe.decode import decode
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import complementary, p18
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.simulation.boards import BoardShape, Pose
@@ -43,6 +44,29 @@ def seen(rig: Rig) -> np.ndarray:
     out = np.zeros(rig.camera.size[::-1], rig.camera.dtype)
     rig.camera.grab(out)
     return out
+
+
+@pytest.mark.computes
+def test_an_image_is_seen_as_the_pattern_of_the_same_grey_levels(world, rig):
+    world.place("plane", Pose(rotation(np.array([0.2, -0.3, 0])), np.array([0, 0, 600.0])))
+    sequence = complementary(PROJECTOR)
+    rig.projector.load(sequence)
+    for index in (0, len(sequence.frames) - 1):
+        rig.projector.show(index)
+        expected = seen(rig).astype(float)
+        levels = render_pattern(sequence, index)
+        rig.projector.show_image(np.repeat(levels[..., None], 3, axis=2))
+        off = seen(rig) - expected
+        assert abs(off.mean()) < 0.7 and off.std() < 5 and np.ptp(expected) > 100
+    image = np.zeros((*PROJECTOR[::-1], 3), np.uint8)
+    image[..., 0] = 255  # a third of the light of white, for a camera without colours
+    rig.projector.show_image(image)
+    red = seen(rig).astype(float)
+    rig.projector.show_level(255)
+    lit = world.renderer(False).truth().mask
+    assert red[lit].mean() / seen(rig)[lit].mean() == pytest.approx(0.36, abs=0.06)
+    with pytest.raises(InputError):
+        rig.projector.show_image(image[1:])
 
 
 @pytest.mark.computes

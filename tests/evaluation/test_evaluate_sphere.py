@@ -30,6 +30,18 @@ def test_radius_and_noise_are_found_in_a_whole_cloud(radius: float | None) -> No
     assert not np.isfinite(result.error_map[~hit]).any()
 
 
+@pytest.mark.parametrize("scale", [0.02, 50.0])
+def test_a_sphere_of_another_size_is_found_alike(scale: float) -> None:
+    points, _ = sphere_before_a_wall()
+    sigma = np.full(points.shape[:2], SIGMA)
+    usual = evaluate_sphere(points, None, sigma)
+    other = evaluate_sphere(points * scale, None, sigma * scale)
+    assert abs(other.points - usual.points) <= 5 and abs(other.excluded - usual.excluded) <= 5
+    assert [other.radius_mm, other.rms_mm] == pytest.approx(
+        [scale * usual.radius_mm, scale * usual.rms_mm], rel=1e-3
+    )
+
+
 def test_errors_are_positive_outwards() -> None:
     front = sphere_depth(CENTRE, RADIUS)
     front[140:150, 210:220] -= 0.3

@@ -4,6 +4,7 @@ alarm."""
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,8 +16,10 @@ from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
+from slviewer.examination import evaluate
 from slviewer.examination.examine import examine
 from slviewer.examination.light import estimate_frame_light
+from slviewer.examination.match import Match, match
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import (
     AXES,
@@ -126,6 +129,23 @@ def test_frames_that_are_all_late_are_named(name: str) -> None:
     sequence, frames = captured(name)
     found = examine(sequence, late(frames)).rejected
     assert [(f.cause, f.value) for f in found] == [("frame-lag", 1.0)]
+
+
+def test_few_hypotheses_are_matched_beside_one_that_explains_a_late_capture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sequence, frames = captured("p18")
+    matched = 0
+
+    def count(*args: Any) -> Match:
+        """Match, and count it."""
+        nonlocal matched
+        matched += 1
+        return match(*args)
+
+    monkeypatch.setattr(evaluate, "match", count)
+    assert causes(sequence, late(frames)) == [("frame-lag", None)]
+    assert 30 < matched < 250, "about 1000 hypotheses and steps of the light were"
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,12 @@ from decode_reference import decode_reference
 from facts import missing_facts
 from fringe_scene import capture, coverage, slope, variants, wrong
 
+from slviewer.examination.examine import examine
 from slviewer.examination.findings import describe_light
 from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe import decode as decoding
 from slviewer.fringe.phase import Reason
-from slviewer.fringe.presets import complementary, gray, p18, phase_steps
+from slviewer.fringe.presets import complementary, gray, gray_bits, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 
 pytestmark = pytest.mark.computes
@@ -104,6 +105,55 @@ def test_a_steady_capture_is_left_as_it_is(name, gamma):
     sequence = SEQUENCES[name]
     light = estimate_frame_light(sequence, capture(sequence, TRUTH, shot=0.02, gamma=gamma))
     assert not light.is_significant and not [*describe_light(sequence, light)]
+
+
+TONED = {
+    "gray": one_axis(gray(PROJECTOR)),
+    "four": SEQUENCES["four"],
+    "wide": PatternSequence(PROJECTOR, tuple(phase_steps("x", 4, 256.0))),
+}
+
+
+def seen_by_an_ordinary_camera(sequence, gain=1.0, per_px=0.9):
+    """Sharp stripes, blurred by the lens, lit by ``gain`` (n,), through a tone curve of 1/2.2."""
+    seen = capture(
+        sequence, slope(240, 320, per_px, start=-20.0), defocus=0.3, psf=0.5, ambient=6.0, read=0.3
+    )
+    light = np.clip(seen * np.reshape(gain, (-1, 1, 1)) / 255, 0, 1)
+    noise = np.random.default_rng(2).normal(0, 0.8, seen.shape)
+    return np.clip(np.rint(255 * light ** (1 / 2.2) + noise), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", TONED)
+def test_a_tone_curve_is_no_varying_light(name):
+    """Of fine stripes, blur before a tone curve lets the mean grow as a gain would."""
+    light = estimate_frame_light(TONED[name], seen_by_an_ordinary_camera(TONED[name]))
+    assert light.terms == () and np.all(light.gain == 1)
+
+
+@pytest.mark.parametrize("name", TONED)
+@pytest.mark.parametrize("per_px", [0.25, 0.9])
+def test_gains_that_a_tone_curve_hides_are_not_made_worse(name, per_px):
+    """At 0.25 projector pixels a pixel the view has a third of the wide period."""
+    sequence = TONED[name]
+    gain = np.random.default_rng(5).uniform(0.8, 1, len(sequence.frames))
+    stack = seen_by_an_ordinary_camera(sequence, gain, per_px)
+    logs = np.log(gain) / 2.2
+    light = estimate_frame_light(sequence, stack)
+    steps = [i for i, f in enumerate(sequence.frames) if f.kind in ("phase", "gray", "inverse")]
+    assert (np.log(light.gain) - logs)[steps].std() < 1.05 * logs[steps].std()
+
+
+@pytest.mark.parametrize("exposure", [0.75, 1.0, 1.6])
+def test_patterns_exposed_unlike_white_are_sound(exposure):
+    """Stripes of the last three bits are narrower than a pixel."""
+    bits = gray_bits("x", 11)
+    sequence = PatternSequence((1920, 1080), (*bits, Frame("white"), Frame("black")))
+    coordinate = slope(120, 200, per_px=9.6, start=20.0)
+    stack = capture(sequence, coordinate, defocus=0.3, psf=0.4, gain=140.0, ambient=2.0, read=1.5)
+    found = examine(sequence, relit(stack, np.r_[[exposure] * 11, 1, 1][:, None, None]))
+    assert not found.rejected and [f.cause for f in found.findings][:1] == ["blur"]
+    assert not missing_facts(found.findings[0].observation, "bit 8 of x, 9 of x, 10 of x")
 
 
 @pytest.mark.slow

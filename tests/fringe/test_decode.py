@@ -7,6 +7,7 @@ from facts import raises
 from fringe_scene import capture, coverage, slope, variants, wrong
 
 from slviewer.errors import InputError
+from slviewer.fringe.binary_bits import has_binary_beside_phase, to_gray_code
 from slviewer.fringe.decode import decode, texture
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
@@ -269,3 +270,37 @@ def test_a_phase_map_of_mixed_sizes_is_refused():
 def test_white_frames_belong_to_every_axis():
     frames = (*SEQUENCES["gray"].frames[:-2], Frame("white"), Frame("black"))
     assert PatternSequence(PROJECTOR, frames).select("y")[-2:] == [len(frames) - 2, len(frames) - 1]
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize("cell", [1, 3])
+def test_plain_binary_numbers_are_decoded_or_masked_never_misread(cell):
+    sequence = replace(gray(PROJECTOR, cell), binary=True)
+    truth = slope()
+    frames = capture(sequence, truth, gain=200)
+    phase, expected = decode(sequence, frames, "x"), decode_reference(sequence, frames, "x")
+    assert wrong(phase, truth, part=3) == 0
+    assert coverage(phase) > 0.6
+    assert np.array_equal(phase.mask, expected.mask)
+    assert wrong(decode(replace(sequence, binary=False), frames, "x"), truth, part=3) > 0
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize("name", ["p18", "complementary", "three steps"])
+@pytest.mark.parametrize("gain", [200, 60])
+def test_binary_numbers_beside_phase_steps_are_combined_to_gray_code(name, gain):
+    sequence, truth = replace(SEQUENCES[name], binary=True), slope()
+    frames = capture(sequence, truth, gain=gain)
+    assert has_binary_beside_phase(sequence)
+    phase = decode(*to_gray_code(sequence, frames), "x")
+    assert wrong(phase, truth) == 0
+    assert 0.92 < coverage(phase) < 1
+    several, _ = to_gray_code(sequence, np.concatenate([frames, frames]))
+    assert not several.binary and not has_binary_beside_phase(several)
+
+
+@pytest.mark.parametrize("period", [300.0, 18.0])
+def test_plain_binary_numbers_beside_phase_steps_are_refused(period):
+    sequence = replace(complementary(PROJECTOR, 4, period), binary=True)
+    with raises(InputError, "binary", "Gray"):
+        decode(sequence, np.zeros((len(sequence.frames), 8, 8), np.uint8), "x")

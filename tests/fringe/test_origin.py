@@ -30,6 +30,21 @@ def test_the_origin_is_found_to_a_fraction_of_a_pixel(name, light, origin):
     assert estimate_gray_origin(sequence, frames, "x") == pytest.approx(origin, abs=0.15)
 
 
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_wide_fringes_in_noise_have_an_origin(seed):
+    """Neighbouring pixels differ by less than their noise: single edges tell nothing."""
+    rng = np.random.default_rng(seed)
+    frames = (*phase_steps("x", 4, 57.0), *gray_bits("x", 4))
+    sequence = PatternSequence((912, 100), frames)
+    x = 360 + 200 * (np.arange(320) + rng.uniform(-20, 20)) / 320 + np.zeros((240, 1))
+    cell = (x / 57).astype(int)
+    shown = [0.5 + 0.4 * np.cos(2 * np.pi * x / 57 + k * np.pi / 2) for k in range(4)]
+    shown += [((cell ^ (cell >> 1)) >> (3 - bit) & 1).astype(float) for bit in range(4)]
+    noisy = [20 + 180 * each + rng.normal(0, 8.0, x.shape) for each in shown]
+    stack = np.clip(noisy, 0, 255).round().astype(np.uint8)
+    assert estimate_gray_origin(sequence, stack, "x") == pytest.approx(0, abs=0.6)
+
+
 def test_the_wrong_sign_and_a_bit_too_many_are_named():
     sequence = complementary(PROJECTOR, 8, 18.0)
     frames = capture(sequence, slope())

@@ -144,8 +144,18 @@ def test_the_wall_is_found_behind_a_sphere() -> None:
     assert rms(plane, points[inliers]) < 0.1
 
 
-def test_no_sphere_on_a_wall() -> None:
+def test_a_cap_that_fills_the_view_is_found() -> None:
+    points = sphere_points(8_000, 0.05)
+    shown = points[(np.abs(points - CENTRE)[:, :2] < 0.4 * RADIUS).all(axis=1)]
+    assert 0.5 * np.linalg.norm(np.ptp(shown, axis=0)) < RADIUS
+    sphere, inliers = ransac_sphere(shown, 0.5)
+    assert sphere.radius == pytest.approx(RADIUS, abs=0.5) and inliers.all()
+
+
+@pytest.mark.parametrize("bend", [0.0, 2.0])
+def test_no_sphere_on_a_wall(bend: float) -> None:
     points = plane_points(5_000, 0.05)
+    points += [0.0, 0.0, 1.0] * (bend * np.cos(points[:, :1] / 60))
     points[::10] = np.nan
     with raises(InputError, "No sphere"):
         ransac_sphere(points, 0.3)

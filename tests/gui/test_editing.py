@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, FloatRect, Page, expect
 from scipy.spatial import cKDTree
 from wizard_page import (
     CALM,
@@ -75,19 +75,19 @@ class Views:
             )
         )
 
-    def wait_for(self, page: Page, points: np.ndarray) -> None:
-        """Wait until the browser's view has moved to points (..., 3) mm."""
+    def show(self, points: np.ndarray) -> bool:
+        """Return whether the browser's view has moved to points (..., 3) mm."""
         (client,) = self._app.server.viser.get_clients().values()
         low, high = np.nanpercentile(points.reshape(-1, 3), [2, 98], axis=0)
+        is_meant = np.linalg.norm(client.camera.look_at - (low + high) / 2) < 0.1 * np.linalg.norm(
+            high - low
+        )
+        reported = self._positions[-1] if self._positions else np.full(3, np.inf)
+        return bool(is_meant and np.allclose(reported, client.camera.position, atol=0.5))
 
-        def has_moved() -> bool:
-            is_meant = np.linalg.norm(
-                client.camera.look_at - (low + high) / 2
-            ) < 0.1 * np.linalg.norm(high - low)
-            reported = self._positions[-1] if self._positions else np.full(3, np.inf)
-            return bool(is_meant and np.allclose(reported, client.camera.position, atol=0.5))
-
-        wait_until(page, has_moved)
+    def wait_for(self, page: Page, points: np.ndarray) -> None:
+        """Wait until the browser's view has moved to points (..., 3) mm."""
+        wait_until(page, lambda: self.show(points))
 
 
 @pytest.fixture(scope="module")
@@ -129,13 +129,18 @@ def wizard(
     return opened, app, operator, views
 
 
-def to_screen(app: App, page: Page, point: np.ndarray) -> tuple[float, float]:
-    """Where a point (3,) mm is on the page, px."""
+def place_in_view(app: App, point: np.ndarray, box: FloatRect) -> tuple[float, float]:
+    """Where a point (3,) mm is on the page, px, whose view has this box."""
     (client,) = app.server.viser.get_clients().values()
     x, y = read_view(client).project(point)
+    return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+
+def to_screen(app: App, page: Page, point: np.ndarray) -> tuple[float, float]:
+    """Where a point (3,) mm is on the page, px."""
     box = page.locator("canvas").first.bounding_box()
     assert box is not None
-    return box["x"] + x * box["width"], box["y"] + y * box["height"]
+    return place_in_view(app, point, box)
 
 
 def drag(page: Page, places: np.ndarray) -> None:

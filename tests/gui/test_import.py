@@ -9,11 +9,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import expect
-from wizard_page import CALM, Opened, button, choose, click, expect_message
+from playwright.sync_api import Browser, expect
+from wizard_page import (
+    CALM,
+    PATIENCE_S,
+    Opened,
+    browse,
+    button,
+    choose,
+    click,
+    expect_message,
+    field,
+)
 
+from slviewer import import_captures
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray
+from slviewer.gui.app import App
+from slviewer.server.secure import Serving
 from slviewer.wizard.operator import Operator
 
 PROJECTOR = (120, 90)
@@ -69,3 +82,23 @@ def test_uploaded_zip_becomes_poses_and_its_faults_are_listed(
     session = operator.session
     assert session is not None and session.load_capture("capture_0").sequence.projector == PROJECTOR
     assert session.load_capture("capture_0").role == "calibration" and opened.errors == []
+
+
+@pytest.mark.computes
+@pytest.mark.slow
+def test_the_board_in_imported_poses_is_recognised(
+    real_data: Path, tmp_path: Path, browser: Browser
+) -> None:
+    folder = tmp_path / "session"
+    import_captures(real_data / "kamino_procam_jpg90", folder, layout="procam-calibration")
+    with Operator(folder, timing=CALM) as operator:
+        operator.wait_until_idle(PATIENCE_S)
+        app = App(operator, Serving(port=0))
+        with browse(browser, app) as opened:
+            click(opened.page, "2. Target")
+            expect(field(opened.page, "Board")).to_have_value("Chessboard")
+            expect(field(opened.page, "Columns")).to_have_value("9")
+            expect(field(opened.page, "Rows")).to_have_value("7")
+            expect(opened.page.get_by_text("5 of 5 images")).to_be_visible()
+        assert operator.snapshot().content.target == ""  # its pitch is the operator's to enter
+        app.close()

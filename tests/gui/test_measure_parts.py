@@ -23,7 +23,7 @@ from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measure import MeasuredSurface
 from slviewer.pipeline.operation import Stored
-from slviewer.records.measurement import DECIDED, Measurement, Quantity
+from slviewer.records.measurement import DECIDED, Measurement, Quantity, list_quantities
 from slviewer.records.record import from_plain, to_plain
 from slviewer.report.surfaces import section_plot
 from slviewer.wizard.result_views import place_at
@@ -58,6 +58,7 @@ def text(html: str) -> str:
         re.sub(r"&#(\d+);", lambda m: chr(int(m[1])), html)
         .replace("\u2060", "")
         .replace("\xa0", " ")
+        .replace("<wbr>", "")
     )
 
 
@@ -140,7 +141,7 @@ def test_measurements_as_text() -> None:
     assert Quantity("height", -1.5, "mm", 0.1).format() == "−1.500 ± 0.200 mm"
     assert Quantity("angle", 90.0, "deg", 0.01, whole=False).format() == "90.000 ± 0.020°*"
     full = text(measurement_html(SPHERE, {"scan_01": "Lion <i>"}))
-    assert missing_facts(full, "25.0000", "0.0200", "rough", "Lion <i>", "sphere") == []
+    assert missing_facts(full, "25.000", "0.020", "rough", "Lion <i>", "sphere") == []
     assert (
         "<b>sphere" not in measurement_html(SPHERE, {}) and missing_facts(full, "calibration") == []
     )
@@ -196,3 +197,27 @@ def test_a_merge_is_painted_and_clicked_as_a_scan_is() -> None:
     scan = MeasuredSurface(points[None], np.full((1, 5), 0.1, np.float32), "scan_01", "stereo", {})
     assert place_at(scan, np.zeros(3), points[3]) == (3, 0)
     assert "no texture" in text(paint_points(surface_values(scan), "texture")[1])
+
+
+def test_notes_on_uncertainty_say_what_holds_for_the_rows_and_say_it_once() -> None:
+    whole = Quantity("distance", 5.0, "mm", 0.1)
+    scatter = Quantity("distance", 5.0, "mm", 0.1, whole=False)
+    residual = Quantity("form", 0.1, "mm")
+
+    def notes(*quantities: Quantity) -> list[str]:
+        return list(
+            list_quantities(
+                {f"m{k}": made("distance", [q]).record for k, q in enumerate(quantities)}
+            ).notes
+        )
+
+    (only,) = notes(scatter)
+    assert "alone" in only and "unknown" in only
+    (only,) = notes(whole)
+    assert "unknown" not in only
+    assert len(notes(whole, residual)) == 2 and notes(residual) == notes(whole, residual)[1:]
+    both = notes(whole, scatter)
+    assert both[0] == only and "m1" in both[1] and "m0" not in both[1]
+    one = [made("distance", [scatter])]
+    shown = text(measurement_html(one[0], {})) + text(measurements_table(one, {}))
+    assert shown.count("expanded") == 1

@@ -156,4 +156,4 @@ def test_shape_is_darker_where_it_turns_from_the_light() -> None:
     assert painted[0, 0] > painted[2, 0] > painted[1, 0] > 0 and legend == ""
     scan = np.array([0.0, 0.001, np.nan], np.float32)
     painted, legend = paint_points(PointValues(points, normals, {DISTANCE: scan}), DISTANCE)
-    assert missing_facts(unescape(legend).replace("\xa0", " "), "1 µm", "unknown") == []
+    assert missing_facts(unescape(legend).replace("\xa0", " "), "0.001 mm", "unknown") == []

@@ -130,3 +130,14 @@ def test_a_notice_is_shown_on_the_start_page_too() -> None:
         assert clocks.until(lambda: app._notified == 1 or bool(failures))
         app.close()
     assert failures == [] and app.shell.current == "start"
+
+
+def test_back_warns_before_it_leaves_the_page(opened: Opened) -> None:
+    page = opened.page
+    address = page.url
+    click(page, "3. Poses")
+    page.go_back()
+    expect(page.get_by_text("Back leaves the wizard")).to_be_visible()
+    assert page.url == address
+    expect(page.get_by_text("Back leaves the wizard")).to_have_count(0)
+    expect(button(page, "3. Poses")).to_be_visible()

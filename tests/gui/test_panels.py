@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 from copies import copy_session
+from facts import missing_facts
 from playwright.sync_api import Browser, Page, expect
 from playwright.sync_api import TimeoutError as NotShownError
 from wizard_page import (
@@ -33,11 +35,11 @@ from wizard_page import (
 from slviewer.gui.app import App
 from slviewer.gui.colouring import paint_points, scan_values, uncertainty
 from slviewer.gui.panel import Painter, display_name
-from slviewer.gui.steps.calibrate import named_poses, verdict_html
+from slviewer.gui.steps.calibrate import colour_errors, named_poses, verdict_html
+from slviewer.gui.steps.export import _describe_view
 from slviewer.gui.steps.rig import list_presets
 from slviewer.gui.steps.scan import point_html, sort_scans
-from slviewer.gui.steps.verify import shape_of
-from slviewer.gui.widgets import colour_range, records_html
+from slviewer.gui.widgets import colour_range, records_html, report_table
 from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.models import save_verdict
 from slviewer.pipeline.operation import Stored
@@ -54,7 +56,7 @@ from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import ScanCloud
-from slviewer.wizard.snapshot import ScanView
+from slviewer.wizard.snapshot import ExportView, ScanView
 
 REJECTED = Verdict.of(
     [
@@ -192,7 +194,7 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     for name in ("object_r1", "object_r2"):
         choose(page, "Scan", name)
         page.wait_for_timeout(1000)  # a busy program may take the click before the choice
-        click(page, "Reconstruct")
+        click(page, "Reconstruct", exact=True)
         assert operator.wait_for(lambda s, name=name: s.scan(name).cloud == "fresh", PATIENCE_S)  # type: ignore[misc]
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
     choose(page, "Colour", "depth")
@@ -235,7 +237,9 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     choose(page, "Source", "Lion <b>1</b> (object_r2)")
     choose(page, "Type", "mesh")
     choose(page, "File type", "GLB")
-    expect(page.get_by_text(re.compile(r"Unit: metres, as glTF demands.*About \d"))).to_be_visible()
+    expect(
+        page.get_by_text(re.compile(r"Unit: metres and y up, as glTF demands.*About \d"))
+    ).to_be_visible()
     choose(page, "Smoothing", "light")
     field(page, "Triangles").fill("6000")
     field(page, "Triangles").press("Tab")
@@ -308,9 +312,9 @@ def measure_distance(page: Page, operator: Operator, count: int) -> None:
     click_until(page, (480, 440), "Click the second point.")
     page.mouse.click(590, 420)
     width = came(operator, count)
-    value = width.quantities[0].value
-    assert width.what == "distance" and 5 < value < 140
-    expect_message(page, re.compile(rf"{value:.3f} ±\s0\.\d+\smm"))
+    assert width.what == "distance" and 5 < width.quantities[0].value < 140
+    shown = re.escape(width.quantities[0].format().rstrip("*")).replace(r"\ ", r"\s")
+    expect_message(page, re.compile(shown))
 
 
 @pytest.mark.slow
@@ -500,12 +504,12 @@ def test_purpose_of_captures_and_order_of_scans() -> None:
     def scan(name: str, purpose: str = "scan") -> ScanView:
         return ScanView(name, name, purpose, "", "fresh", Reconstruction(), b"")  # type: ignore[arg-type]
 
-    assert [shape_of(scan(n)) for n in ("plane_01", "sphere_2", "object_r1")] == [
+    assert [scan(n).shape for n in ("plane_01", "sphere_2", "object_r1")] == [
         "plane",
         "sphere",
         "scan",
     ]
-    assert shape_of(scan("scan_01", "plane")) == "plane"
+    assert scan("scan_01", "plane").shape == "plane"
     names = [s.name for s in sort_scans([scan("a"), scan("plane_1"), scan("b")])]
     assert names == ["b", "a", "plane_1"]
 
@@ -593,3 +597,36 @@ def test_residuals_name_the_second_camera() -> None:
     )
     assert [column.title for column in table.columns] == ["second camera", "camera"]
     assert table.values(table.rows[0])[1] == "second camera x" and table.notes == ["second camera"]
+
+
+def test_names_in_front_of_many_columns_stand_in_rows_of_their_own() -> None:
+    names, columns = ["a_long_name_of_a_capture", "b"], ("Model", "RMS", "Floor", "Excluded")
+    rows = [
+        {"capture": name, "model": "stereo", **{each.lower(): 1.0 for each in columns[1:]}}
+        for name in names
+    ]
+    html = report_table(Table.of(rows, "Planes"))
+    lines = [re.sub(r"<[^>]*>", "", line) for line in html.split("<tr>")[1:]]
+    assert unescape(lines[0]).startswith("Capture / model") and len(lines) == 1 + 2 * len(names)
+    assert html.count(' colspan="4"') == 2 and "<wbr>" in html
+
+
+def test_poses_are_red_by_their_error_against_the_noise_not_the_best_pose() -> None:
+    errors = {"best": 0.010, "usual": 0.013, "good": 0.016, "other": 0.014, "bad": 0.09}
+    colours = colour_errors(errors, [0.0102])
+    green = colours["best"]
+    assert green[1] > green[0] and colours["usual"] == colours["other"] == green
+    assert colours["good"][1] > colours["good"][0]  # rather green
+    assert colours["bad"][0] > 2 * colours["bad"][1]
+    # without an estimate of the noise the poses are compared with their median
+    alike = colour_errors({"a": 0.3, "b": 0.31, "c": 0.33}, [])
+    assert all(g > r for r, g, _ in alike.values())
+
+
+def test_a_mesh_that_the_view_does_not_show_is_named() -> None:
+    small = ExportView("part.stl", Path("part.stl"), 1000)
+    assert _describe_view("mesh", None, "stl") == _describe_view("mesh", small, "stl") == ""
+    assert _describe_view("cloud", small, "xyz") == ""
+    assert missing_facts(_describe_view("mesh", small, "3mf"), "3mf", "points") == []
+    large = replace(small, bytes=100_000_000)
+    assert missing_facts(_describe_view("merged-mesh", large, "stl"), "100 MB", "points") == []

@@ -48,7 +48,7 @@ def test_scan_outside_the_calibrated_depths_says_so(shown: Opened) -> None:
     page = shown.page
     click(page, "6. Scan")
     choose(page, "Scan", "plane_01")
-    click(page, "Reconstruct")
+    click(page, "Reconstruct", exact=True)
     expect(
         page.get_by_text("of the points are outside the calibrated depths").first
     ).to_be_visible()

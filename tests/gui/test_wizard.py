@@ -270,9 +270,8 @@ def click_cloud_until(page: Page, answers: Callable[[], bool]) -> None:
 
 
 def hands_free(page: Page, name: str) -> None:
-    """The next pose by holding still."""
+    """The next pose by holding still: the simulated board goes there by itself."""
     page.get_by_role("checkbox", name="Hands-free").check()
-    click(page, "Place board")
     expect(page.get_by_text("Hold still")).to_be_visible()
     expect(pose_row(page, name, "good")).to_be_visible()
     page.get_by_role("checkbox", name="Hands-free").uncheck()

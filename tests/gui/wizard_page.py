@@ -110,9 +110,9 @@ def wait_until(page: Page, holds: Callable[[], object]) -> None:
         page.wait_for_timeout(50)
 
 
-def button(page: Page, name: str) -> Locator:
-    """The button that says so."""
-    return page.get_by_role("button", name=name)
+def button(page: Page, name: str, *, exact: bool = False) -> Locator:
+    """The button that says so, or, unless ``exact``, that and more."""
+    return page.get_by_role("button", name=name, exact=exact)
 
 
 @contextmanager
@@ -156,12 +156,12 @@ def wait_until_still(page: Page, quiet_ms: float = 250) -> None:
     page.evaluate(STILL, quiet_ms)
 
 
-def click(page: Page, name: str) -> None:
+def click(page: Page, name: str, *, exact: bool = False) -> None:
     """Click the button that says so once the page stands still: what is drawn anew just then may
     take the click."""
-    expect(button(page, name)).to_be_enabled()
+    expect(button(page, name, exact=exact)).to_be_enabled()
     wait_until_still(page)
-    button(page, name).click()
+    button(page, name, exact=exact).click()
 
 
 def unfold(page: Page, folder: str) -> None:

@@ -203,6 +203,35 @@ def test_a_missing_step_does_not_keep_a_scan_from_its_place() -> None:
 
 @pytest.mark.slow
 @pytest.mark.computes
+@pytest.mark.parametrize("seed", range(41, 49))
+def test_an_open_model_is_found_whichever_way_its_triangles_face(seed) -> None:
+    rng = np.random.default_rng(seed)
+    bodies = [trimesh.creation.box((120, 90, 10))]
+    for x, y in ((-40, 25), (30, -20), (35, 25)):
+        size = rng.uniform([15, 10, 16], [30, 25, 30])
+        bodies.append(trimesh.creation.box(size))
+        bodies[-1].apply_translation([x, y, size[2] / 2 - 3])
+    body = trimesh.util.concatenate(bodies)
+    upper = body.submesh([np.flatnonzero(body.face_normals[:, 2] > -0.5)], append=True)
+    places, face = trimesh.sample.sample_surface(upper, 30_000, seed=seed)
+    hidden = [(np.abs(places - each.centroid) < each.extents / 2 - 1e-6).all(1) for each in bodies]
+    places, normals = (a[~np.any(hidden, axis=0)] for a in (places, upper.face_normals[face]))
+    points = places + 0.03 * rng.normal(size=(len(places), 1)) * normals
+    R = rotation(np.radians([180, *rng.uniform(-20, 20, 2)]))
+    t = np.array([10.0, -5.0, 480.0])
+    over = _pose(rotation(np.array([np.pi, 0, 0])), np.zeros(3))  # a plate lies so too
+    for faces in (upper.faces, upper.faces[:, ::-1]):
+        surface = NominalSurface(Mesh(upper.vertices, faces))
+        found_T = nominal_pose.improve_pose(points, normals, surface, 0.03, over)
+        assert np.abs(found_T - np.eye(4)).max() < 0.1
+        found = deviation(points @ R.T + t, Mesh(upper.vertices, faces), normals=normals @ R.T)
+        wrong = found.T_nominal_scan @ _pose(R, t)
+        assert np.abs(wrong - np.eye(4)).max() < 0.02
+        assert 0.028 < found.statistics()["rms"] < 0.032
+
+
+@pytest.mark.slow
+@pytest.mark.computes
 def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
     box = trimesh.creation.box((60, 40, 20))
     points, normals = box_scan(0.01)

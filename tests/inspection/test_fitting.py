@@ -213,7 +213,7 @@ def test_a_saved_fit_gives_the_same_feature_and_quantities() -> None:
     assert quantities == fit.quantities()
     assert (
         missing_facts(
-            quantities[0].format(), f"{quantities[0].value:.3f}", f"{quantities[0].U:.3f}"
+            quantities[0].format(), f"{quantities[0].value:.4f}", f"{quantities[0].U:.4f}"
         )
         == []
     )

@@ -5,6 +5,7 @@ import pytest
 from facts import raises
 
 from slviewer.errors import InputError
+from slviewer.geometry.shapes import fit_sphere
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
@@ -83,15 +84,34 @@ def test_an_axis_is_out_of_square_by_its_lean() -> None:
     assert_covers(q, 0.004 * 30, 0.03)
 
 
+def directions(rng: np.random.Generator, angle: float) -> np.ndarray:
+    """Unit vectors (N, 3), evenly over the cap of this half angle (rad) about z."""
+    c, t = rng.uniform(np.cos(angle), 1, N), rng.uniform(0, 2 * np.pi, N)
+    return np.stack([np.sqrt(1 - c**2) * np.cos(t), np.sqrt(1 - c**2) * np.sin(t), c], 1)
+
+
 def test_position_is_the_diameter_of_the_zone() -> None:
     rng = np.random.default_rng(10)
-    c, t = rng.uniform(np.cos(1.0), 1, N), rng.uniform(0, 2 * np.pi, N)
-    out = np.stack([np.sqrt(1 - c**2) * np.cos(t), np.sqrt(1 - c**2) * np.sin(t), c], 1)
+    out = directions(rng, 1.0)
     points = (10 + NOISE * rng.normal(size=(N, 1))) * out + [0.03, 0.02, 0.01]
     q = position_error(
         fit_feature("sphere", points), points, Feature("sphere", np.zeros(3), None, 10.0)
     )
     assert_covers(q, 2 * np.linalg.norm([0.03, 0.02, 0.01]), 0.015)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_dent_that_moves_a_dome_is_within_the_uncertainty_of_its_position(seed: int) -> None:
+    rng = np.random.default_rng([14, seed])
+    out = directions(rng, np.pi / 2)
+    off = np.arccos(np.clip(out @ out[0], -1, 1))
+    depth = rng.uniform(2, 3.5) * np.exp(-((off / rng.uniform(0.08, 0.12)) ** 2))
+    true = 2 * float(np.linalg.norm(fit_sphere((10 - depth[:, None]) * out).centre))
+    points = (10 - depth[:, None] + NOISE * rng.normal(size=(N, 1))) * out
+    nominal = Feature("sphere", np.zeros(3), None, 10.0)
+    q = position_error(fit_feature("sphere", points), points, nominal)
+    assert q.U is not None and abs(true - q.value) < 0.7 * q.U
+    assert q.value + q.U < 4 * true
 
 
 def test_position_of_an_axis_is_that_of_its_ends() -> None:

@@ -11,20 +11,22 @@ import pytest
 from copies import copy_session
 from facts import missing_facts
 
+from slviewer.calibration.camera import calibrate_camera
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import p18
-from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate, calibrate_camera_alone
 from slviewer.pipeline.certificate import verify_report
 from slviewer.pipeline.report import report
 from slviewer.records.calibration import StereoFit
 from slviewer.session.importers.camera_file import read_camera_file
+from slviewer.session.importers.images import read_image
 from slviewer.session.store import Session
 from slviewer.simulation.boards import FLAT, printed_board
 from slviewer.simulation.plans import target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.truth import rig_record
-from slviewer.target.board import Board
+from slviewer.target.board import Board, Detection
 
 Run = Callable[..., tuple[int, str, str]]
 pytestmark = pytest.mark.computes
@@ -65,6 +67,50 @@ def test_a_camera_is_calibrated_from_pictures(pictures: Path, run: Run, tmp_path
     storage = cv2.FileStorage(str(out), cv2.FILE_STORAGE_READ)
     np.testing.assert_allclose(storage.getNode("K_camera").mat(), K)
     storage.release()
+
+
+def test_a_camera_calibration_states_how_many_features_were_seen() -> None:
+    board, size = Board.parse("chessboard:9x6:20"), (640, 480)
+    K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+    rng = np.random.default_rng(1)
+    detections = {}
+    for i in range(8):
+        turn, shift = rng.uniform(-0.4, 0.4, 3), np.array([rng.uniform(-180, 20), -50, 300.0])
+        seen, _ = cv2.projectPoints(board.points, turn, shift, K, np.zeros(5))
+        pixels = seen[:, 0] + rng.normal(0, 0.03, (len(seen), 2))
+        ids = np.flatnonzero(((pixels > 0) & (pixels < size)).all(1))
+        detections[f"picture_{i}"] = Detection(pixels[ids], ids)
+    counts = {name: len(each.ids) for name, each in detections.items()}
+    assert min(counts.values()) < 54
+    calibration = calibrate_camera(board, detections, size)
+    assert calibration.to_json()["features"] == counts
+    fewest, most = min(counts.values()), max(counts.values())
+    assert not missing_facts(calibration.text(), "54 features", f"{fewest} to {most}")
+
+
+def test_bars_and_a_dead_column_are_no_part_of_pictures(pictures: Path, tmp_path: Path) -> None:
+    names = [f"board_{i}.png" for i in range(4)]
+    rng = np.random.default_rng(0)
+    for name in names:
+        image = np.pad(read_image(pictures / name), ((0, 0), (60, 30)), constant_values=128)
+        image[:, 200] = 0
+        cv2.imwrite(str(tmp_path / name), image)
+    noisy = tmp_path / "noisy"
+    noisy.mkdir()
+    for name in names:
+        image = read_image(tmp_path / name)
+        bars = np.rint(128 + rng.normal(0, 1.5, image.shape)).astype(np.uint8)
+        image[:, :60], image[:, -30:] = bars[:, :60], bars[:, -30:]
+        cv2.imwrite(str(noisy / name), image)
+    plain = calibrate_camera_alone(pictures, str(BOARD), poses=names)
+    for folder, named in ((tmp_path, ("60 px", "30 px", "column 200")), (noisy, ("column 200",))):
+        barred = calibrate_camera_alone(folder, str(BOARD))
+        moved = plain.lens.K + np.array([[0, 0, 60], [0, 0, 0], [0, 0, 0]])
+        sigma = max(plain.focal_sigma_px)
+        np.testing.assert_allclose(barred.lens.K, moved, atol=0.5 * sigma)
+        assert barred.verdict.level == plain.verdict.level and not barred.excluded
+        (note,) = (f for f in barred.verdict.findings if f.cause == "constant-pixels")
+        assert not missing_facts(note.observation, *named)
 
 
 def test_pictures_are_chosen_and_too_few_are_refused(pictures: Path, run: Run) -> None:

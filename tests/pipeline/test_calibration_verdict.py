@@ -13,7 +13,8 @@ from facts import missing_facts
 from operations import reconstructed
 
 from slviewer.calibration.observe import Smoothing
-from slviewer.pipeline.calibrate import calibrate
+from slviewer.fringe.presets import p18
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate, choose_poses
 from slviewer.pipeline.models import (
     available_models,
     load_last_verdict,
@@ -25,11 +26,28 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.poses import load_judged
 from slviewer.records.verdict import Finding, Verdict
+from slviewer.session.capture import NewCapture
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from tests.proofs.causes import BOARD, FaultBench
 
 pytestmark = pytest.mark.computes
+
+
+def test_frames_that_are_there_twice_count_once(tmp_path: Path) -> None:
+    sequence = p18((64, 64))
+    stacks = np.random.default_rng(0).integers(0, 256, (2, len(sequence.frames), 48, 64), np.uint8)
+    poses = [NewCapture(f"pose_{k}", sequence, stacks[k % 2]) for k in range(5)]
+    settings, warned = CalibrateSettings("circles:9x7:20"), list[str]()
+    with Session.create(tmp_path / "session") as store:
+        store.save_captures(poses, "calibration", board=str(settings.target))
+        names, excluded = choose_poses(store, settings, warned.append)
+        assert names == ["pose_0", "pose_1"]
+        assert list(excluded) == ["pose_2", "pose_3", "pose_4"] and "pose_1" in excluded["pose_3"]
+        assert len(warned) == 3 and not missing_facts(warned[0], "pose_2", "pose_0")
+        without = replace(settings, exclude=["pose_0"])  # then a copy is used
+        assert choose_poses(store, without, warned.append)[0] == ["pose_1", "pose_2"]
+
 
 Run = Callable[..., tuple[int, str, str]]
 POSES = 7

@@ -175,6 +175,12 @@ def test_check_finds_a_projector_that_was_turned(calibrated: Path) -> None:
 
 
 @pytest.mark.slow
+def test_one_of_eight_poses_cannot_be_checked_by_the_others(calibrated: Path) -> None:
+    with raises(InputError, "pose_03", "own 8 poses", "7 others", "once more"):
+        check(calibrated, "pose_03")
+
+
+@pytest.mark.slow
 def test_check_answers_and_remembers(calibrated: Path) -> None:
     for name in ("same", "panned", "one_axis"):
         capture_board(calibrated, name)

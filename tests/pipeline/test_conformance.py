@@ -115,6 +115,15 @@ def test_a_good_camera_has_no_fault():
     assert check_turntable(SimulatedTurntable(SimulatedWorld(letter(0.1)))) == []
 
 
+@pytest.mark.computes
+def test_a_projector_that_takes_any_image_is_named(monkeypatch):
+    rig = simulated_rig(SimulatedWorld(letter(0.1)))
+    monkeypatch.setattr(rig.projector, "show_image", lambda image: None)
+    faults = check_projector(rig.projector)
+    assert len(faults) == 3
+    assert not missing_facts(faults[0], "show_image", "InputError", "(1139, 912, 3)")
+
+
 @pytest.mark.parametrize(
     ("camera", "facts"),
     [

@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "target"))
 from rendered_board import View
 
 from slviewer.target.board import Board
+from slviewer.target.detect import recognise_board
 
 BOARD = Board.parse("circles:7x5:20")
 VIEW = View(size=(320, 240), supersample=4, tilt=15, roll=10)
@@ -94,3 +95,28 @@ def test_corners_that_are_seen_of_a_charuco_board_keep_their_numbers(tmp_path: P
     assert found.detected and 8 <= len(found.index) < len(board.points)
     assert not missing_facts(result.text(), f"{len(found.index)} of 24 corners")
     assert [row[1] for row in result.rows()] == found.index
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize("notation", ["circles:7x5:20", "chessboard:8x6:20"])
+def test_a_board_is_recognised_but_its_pitch(
+    notation: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    board, shown = Board.parse(notation), notation.rpartition(":")[0]
+    for tilt in (0, 20):
+        view = View(size=(320, 240), supersample=3, tilt=tilt, roll=10)
+        cv2.imwrite(str(tmp_path / f"{tilt}.png"), view.render(board))
+    cv2.imwrite(str(tmp_path / "wall.png"), np.full((240, 320), 120, np.uint8))
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    assert main(["detect", str(tmp_path)]) == 2
+    assert missing_facts(capsys.readouterr().err, "2 of 3", f"--target {shown}:PITCH") == []
+
+
+@pytest.mark.computes
+def test_no_board_is_recognised_where_images_show_none_or_two(tmp_path: Path) -> None:
+    wall = np.full((240, 320), 120, np.uint8)
+    view = View(size=(320, 240), supersample=3)
+    charuco = view.render(Board.parse("charuco:7x5:20"))
+    two = [view.render(Board.parse(each)) for each in ("circles:7x5:20", "chessboard:8x6:20")]
+    for images in ([wall, wall], [charuco, charuco], two, [wall[:8]], []):
+        assert recognise_board(images) is None

@@ -3,10 +3,12 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from slviewer.errors import InputError, SessionError
 from slviewer.pipeline.duplicate import duplicate_calibration
+from slviewer.pipeline.import_cloud import import_cloud
 from slviewer.pipeline.models import available_models
 from slviewer.session.store import Session
 from slviewer.wizard.session_reader import read_overview
@@ -43,5 +45,14 @@ def test_duplicate_of_nothing_leaves_nothing(tmp_path: Path) -> None:
         duplicate_calibration(tmp_path / "none", tmp_path / "copy")
     assert [each.name for each in tmp_path.iterdir()] == ["empty"]
     assert read_overview(tmp_path / "empty").holds == "0 poses, 0 scans"
+
     (tmp_path / "empty" / "session.json").write_text("{")
     assert "session.json" in read_overview(tmp_path / "empty").fault
+
+
+def test_overview_of_imported_clouds_has_no_picture(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "part.xyz", np.random.default_rng(0).normal((0, 0, 500), 20, (500, 3)))
+    with Session.create(tmp_path / "clouds") as session:
+        import_cloud(session, [tmp_path / "part.xyz"])
+    overview = read_overview(tmp_path / "clouds")
+    assert "1 scan" in overview.holds and not overview.thumbnail

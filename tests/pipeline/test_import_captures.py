@@ -13,7 +13,7 @@ import pytest
 from facts import missing_facts
 
 from slviewer.fringe.patterns import render_pattern
-from slviewer.fringe.presets import gray, phase_steps
+from slviewer.fringe.presets import gray, gray_bits, phase_steps
 from slviewer.fringe.sequence import PatternSequence, PerAxis
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.import_captures import find_captures
@@ -131,6 +131,29 @@ def test_a_code_that_is_centred_on_the_projector(run: Run, tmp_path: Path) -> No
     with Session.open(tmp_path / "session") as store:
         capture = store.load_capture("scan")
         assert capture.sequence.gray_origin_px == PerAxis(-4.5, -19.5)
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_fringes_that_begin_late_do_not_shift_the_coordinates(
+    run: Run, tmp_path: Path, quarters: int
+) -> None:
+    """Sines, and complementary codes whose edges lie at -pi, begin quarters of a period late."""
+    frames = [*phase_steps("x", 4, 15.0), *gray_bits("x", 3)]
+    sequence = PatternSequence(PROJECTOR, tuple(frames), phase_offset_rad=np.pi / 2 * quarters)
+    for number, frame in enumerate(photographed(sequence, 0)):
+        (tmp_path / "scan").mkdir(exist_ok=True)
+        assert cv2.imwrite(str(tmp_path / "scan" / f"{number:02d}.png"), frame)
+    (tmp_path / "scan" / "late.toml").write_text(
+        'projector = "120x90"\norder = "name"\n[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 4\n'
+        'period_px = 15.0\n[[frames]]\nkind = "gray"\naxis = "x"\nbits = 3\n'
+    )
+    status, _, err = run("import", "auto", tmp_path / "scan", tmp_path / "session")
+    assert status == 0 and ("phase_offset" in err) == (quarters > 0)
+    with Session.open(tmp_path / "session") as store:
+        capture = store.load_capture("scan")
+        decoded = decode_capture(capture)["x"].coordinate
+    off = decoded - np.arange(PROJECTOR[0])
+    assert abs(np.nanmedian(off)) < 0.2 and np.nanmax(np.abs(off)) < 1
 
 
 @pytest.fixture

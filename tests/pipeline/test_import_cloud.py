@@ -8,11 +8,14 @@ import pytest
 from slviewer.errors import InputError, UsageError
 from slviewer.pipeline.accept import check
 from slviewer.pipeline.edit import edit_scan
+from slviewer.pipeline.export import export
 from slviewer.pipeline.import_cloud import import_cloud
 from slviewer.pipeline.measure import measure, relate
+from slviewer.pipeline.merge import MergeSettings, merge
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.reconstruct import reconstruct, verify
 from slviewer.pipeline.report import inspect
+from slviewer.session.importers.clouds import read_cloud
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.surface.shapes import PointSet
@@ -84,6 +87,52 @@ def test_imported_scan_is_listed_checked_and_replaced(session: Path, tmp_path: P
     with Session.open(session) as store:
         assert store.load_capture("ball").hash != before
         assert store.state_of("clouds/ball") == "fresh"
+
+
+def test_survey_coordinates_and_scalars_are_exported_as_they_came(tmp_path: Path) -> None:
+    """Clouds that are far from the origin share the origin that is subtracted, and a nearer one is
+    said to be elsewhere."""
+    place, session = np.array([694_123_456.0, 5_155_987_654.0, 85_000.0]), tmp_path / "session"
+    points = [np.round(ball(seed)[0], 4) + place + (300.0 * seed, 0, 0) for seed in range(2)]
+    time = np.arange(len(points[0])) + 1.7e9 + 0.25
+    for name, each in zip("ab", points, strict=True):
+        rows = np.column_stack([each, time])
+        np.savetxt(
+            tmp_path / f"{name}.csv", rows, "%.4f", ",", header="x,y,z,GPS time", comments=""
+        )
+    np.savetxt(tmp_path / "near.xyz", ball(2)[0], "%.4f")
+    files = [tmp_path / name for name in ("a.csv", "b.csv", "near.xyz")]
+    found = import_cloud(session, files)
+    origins = [found[name].imported.origin_mm for name in ("a", "b", "near")]
+    assert origins == [(694_123_000.0, 5_155_988_000.0, 85_000.0)] * 2 + [None]
+    assert "export adds" in found.text()
+    assert "place to them is not kept" in " ".join(found["near"].imported.notes)
+    assert found["a"].imported.scalars == ("GPS_time",)
+    for suffix in ("ply", "pcd", "csv"):
+        export(session, "cloud", "b", out=tmp_path / f"o.{suffix}")
+        (cloud,) = read_cloud(tmp_path / f"o.{suffix}")[1]
+        assert np.abs(cloud.points - points[1]).max() < 1e-4
+        assert np.array_equal(cloud.scalars["GPS_time"], time)
+    words = export(session, "cloud", "b", out=tmp_path / "o.xyz").words
+    assert "without GPS_time" in words
+
+
+def test_a_merge_keeps_the_origin_and_says_what_it_does_not_hold(tmp_path: Path) -> None:
+    place, session = np.array([694_123_456.0, 5_155_987_654.0, 85_000.0]), tmp_path / "session"
+    u, v = np.meshgrid(*(np.linspace(-20, 20, 80),) * 2)
+    bumps = 3 * np.sin(u / 4) + 2 * np.cos(v / 5) + u * v / 80
+    points = np.stack([u, v, bumps], axis=-1).reshape(-1, 3) + place
+    for seed, name in enumerate("ab"):
+        noise = np.random.default_rng(seed).normal(0, 0.01, points.shape)
+        rows = np.column_stack([points + noise, np.full(len(points), 21.5)])
+        np.savetxt(tmp_path / f"{name}.csv", rows, "%.4f", ",", header="x,y,z,T", comments="")
+    import_cloud(session, [tmp_path / "a.csv", tmp_path / "b.csv"])
+    warnings = list[str]()
+    merge.run(session, MergeSettings(["a", "b"], "a", start="identity"), warn=warnings.append)
+    assert "holds no T" in " ".join(warnings)
+    export(session, "merge", out=tmp_path / "m.ply")
+    (merged,) = read_cloud(tmp_path / "m.ply")[1]
+    assert np.abs(merged.points.mean(axis=0) - points.mean(axis=0)).max() < 0.5
 
 
 def test_mesh_through_imported_points_is_closed(session: Path) -> None:

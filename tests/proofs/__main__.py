@@ -16,16 +16,23 @@ from slviewer.pipeline.operation import Progress, ignore_progress, part
 from tests.proofs.acceptance import prove_acceptance
 from tests.proofs.accuracy import prove_accuracy, prove_uncertainty
 from tests.proofs.cameras import prove_cameras
-from tests.proofs.captures import prove_captures
+from tests.proofs.captures import prove_captures, prove_pipelines
 from tests.proofs.causes import prove_causes
+from tests.proofs.cut_boards import prove_cut_boards
+from tests.proofs.files import prove_files
 from tests.proofs.guidance import prove_guidance
+from tests.proofs.hand_eye import prove_hand_eye
 from tests.proofs.hostile import prove_hostile
+from tests.proofs.laws import prove_laws
+from tests.proofs.limits import prove_limits
 from tests.proofs.parts import prove_parts
 from tests.proofs.plan import prove_plan
 from tests.proofs.plan_faults import prove_plan_faults
 from tests.proofs.proof import Proof
 from tests.proofs.registration import prove_registration
+from tests.proofs.relate_rigs import prove_relate_rigs
 from tests.proofs.reports import prove_reports
+from tests.proofs.shown_image import prove_shown
 from tests.proofs.surfaces import prove_edges, prove_surfaces
 
 
@@ -67,15 +74,23 @@ def prove_verdicts(scale: float, *, seed: int, progress: Progress) -> Proof:
 
 CLAIMS: Mapping[str, tuple[str, Callable[..., Proof]]] = {
     "accuracy": ("accuracy at the noise floor", prove_accuracy),
+    "boards": ("boards cut by border, light or hand", prove_cut_boards),
     "cameras": ("two cameras", prove_cameras),
     "causes": ("faults called by their names", prove_named_faults),
     "edges": ("printed edges without ridges", prove_edges),
+    "files": ("files of other programs", prove_files),
     "guidance": ("guided poses", prove_guidance),
+    "hand-eye": ("the camera's place on a robot", prove_hand_eye),
     "hostile": ("captures of a hostile rig", prove_hostile),
+    "laws": ("laws of scale, order and readout", prove_laws),
+    "limits": ("rigs at their limits", prove_limits),
     "parts": ("verdicts on parts", prove_verdicts),
+    "pipelines": ("captures of ordinary cameras", prove_pipelines),
     "plan": ("tolerances of an inspection plan", prove_plan),
     "registration": ("scans in one frame", prove_registration),
     "reports": ("reported situations", prove_reports),
+    "rigs": ("several rigs in one frame", prove_relate_rigs),
+    "shown": ("results shown on the part", prove_shown),
     "surfaces": ("surfaces that light themselves", prove_surfaces),
     "uncertainty": ("predicted uncertainty", prove_uncertainty),
 }

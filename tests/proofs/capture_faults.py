@@ -470,7 +470,7 @@ CAPTURE_FAULTS: Mapping[str, CaptureFault] = {
 }
 
 
-def draw_faulty(fault: str, kind: CaptureKind, seed: int) -> FaultyCapture:
-    """A capture of a kind with a fault, the same for the same seed."""
+def draw_faulty(fault: str, kind: CaptureKind, seed: int, pipeline: str = "") -> FaultyCapture:
+    """A capture of a kind with a fault, seen through a pipeline, the same for the same seed."""
     own = crc32(f"{fault} {seed}".encode())  # other qualities for each fault
-    return CAPTURE_FAULTS[fault].strike(draw_setup(kind, own), np.random.default_rng(own))
+    return CAPTURE_FAULTS[fault].strike(draw_setup(kind, own, pipeline), np.random.default_rng(own))

@@ -8,7 +8,7 @@ simulation; how the faults are made does not depend on how they are searched for
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Literal
 
@@ -21,7 +21,8 @@ from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.examination import check_capture_exposure, examine_frames
 from slviewer.pipeline.operation import Progress
 from tests.proofs.capture_faults import CAPTURE_FAULTS, FaultyCapture, draw_faulty
-from tests.proofs.proof import BandCheck, Proof, prove_checks
+from tests.proofs.pipelines import PIPELINES
+from tests.proofs.proof import BandCheck, Proof, judge_all, prove_checks
 from tests.proofs.simulated_capture import (
     KINDS,
     CaptureKind,
@@ -51,6 +52,7 @@ _SEVERITIES: dict[str, Severity] = {"rejected": "bad", "doubtful": "warning", "n
 """Of the findings of an examination; the worst first."""
 _REFUSALS = {
     r"are saturated": "saturation",
+    r"does not resolve": "blur",
     r"light from other surfaces": "indirect-light",
     r"outside the projector": "projector-size",
     r"which the projector spans": "fringe-period|projector-size",
@@ -165,13 +167,40 @@ def plan_cases(scale: float, seed: int) -> Iterator[tuple[str, CaptureKind, int]
             yield fault, kind, 1000 * seed + i // len(kinds)
 
 
-def examine_case(fault: str, kind: CaptureKind, seed: int) -> CaptureCase:
+def prove_pipelines(scale: float, seed: int, progress: Progress) -> Proof:
+    """Examine sound captures and faults, a kind each in turn, through every pipeline of ordinary
+    cameras. ``scale``: share of the captures of a full run."""
+    plan = [
+        (f"{pipeline}: {fault}, {kind}", (fault, kind, each, pipeline))
+        for number, pipeline in enumerate(PIPELINES)
+        for fault, kind, each in plan_cases(scale / len(PIPELINES), 100 * seed + number)
+    ]
+    cases: dict[str, list[CaptureCase]] = {name: [] for name in PIPELINES}
+    judged = judge_all(examine_case, plan, progress)
+    for (_, (*_, pipeline)), case in zip(plan, judged, strict=True):
+        cases[pipeline].append(case)
+    every = summarize_cases([case for own in cases.values() for case in own], scale)
+    rows = [_list_pipeline(name, own) for name, own in cases.items()]
+    return replace(every, rows=rows, record={"pipelines": rows, **every.record})
+
+
+def _list_pipeline(name: str, cases: Sequence[CaptureCase]) -> Row:
+    """The row of a pipeline: how often each outcome was seen."""
+    faulty = [case for case in cases if case.fault != NO_FAULT]
+    counts = Counter(case.outcome for case in cases)
+    row: Row = {"pipeline": name}
+    row |= {outcome: counts[outcome] for outcome in (*OF_SOUND[:2], *OF_FAULTS)}
+    row["right %"] = 100 * sum(case.outcome in PASSED for case in faulty) / max(len(faulty), 1)
+    return row
+
+
+def examine_case(fault: str, kind: CaptureKind, seed: int, pipeline: str = "") -> CaptureCase:
     """Render one capture, sound where ``fault`` is "none", examine it, and judge the result."""
     if fault == NO_FAULT:
-        setup = draw_setup(kind, seed)
+        setup = draw_setup(kind, seed, pipeline)
         faulty = FaultyCapture(setup, setup, frozenset())
     else:
-        faulty = draw_faulty(fault, kind, seed)
+        faulty = draw_faulty(fault, kind, seed, pipeline)
     setup = faulty.setup
     capture = render_capture(setup)
     start = perf_counter()

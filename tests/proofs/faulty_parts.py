@@ -417,7 +417,7 @@ def _section_range(f: TrueFeature) -> float:
     columns = np.hstack([c / np.linalg.norm(c, axis=1, keepdims=True), np.ones((len(c), 1))])
     section = np.minimum((along - along.min()) / np.ptp(along) * 20, 19).astype(int)
     ranges = []
-    for k in range(20):
+    for k in np.unique(section):  # a pin that stands askew has sections without points
         off, own = f.off[section == k], columns[section == k]
         ranges.append(np.ptp(off - own @ np.linalg.lstsq(own, off, rcond=None)[0]))
     return float(max(ranges))

@@ -1,10 +1,8 @@
 """Whether verdicts on parts are true: no wrong part passes, no right part fails, and what is named
 lies where the part is wrong."""
 
-import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from time import perf_counter
 from typing import Literal, get_args
@@ -29,9 +27,9 @@ from tests.proofs.part_cases import (
     make_case,
     plan_part_cases,
 )
-from tests.proofs.proof import BandCheck, Proof, prove_checks
+from tests.proofs.proof import BandCheck, Proof, judge_all, prove_checks
 
-CASES, PROCESSES = 1200, 2
+CASES = 1200
 """Of a full run."""
 MAX_FALSE_FAILS, MAX_UNDECIDED, MIN_NAMED = 0.005, 0.02, 0.95
 HIDING = ("table", "touching clamp")
@@ -183,16 +181,9 @@ def prove_parts(scale: float, seed: int, progress: Progress) -> Proof:
     ``scale``: share of the cases of a full run.
     """
     setups = plan_part_cases(max(1, round(scale * CASES)), seed)
-    cases: list[JudgedCase] = []
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(PROCESSES, spawn) as pool:
-        for k, (setup, case) in enumerate(
-            zip(setups, pool.map(judge_part_case, setups, chunksize=4), strict=True)
-        ):
-            progress(k / len(setups), f"{setup.kind}, {setup.fault}")
-            if case is not None:
-                cases.append(case)
-    return summarize_parts(cases, scale)
+    named = [(f"{setup.kind}, {setup.fault}", (setup,)) for setup in setups]
+    judged = judge_all(judge_part_case, named, progress)
+    return summarize_parts([case for case in judged if case is not None], scale)
 
 
 def summarize_parts(cases: Sequence[JudgedCase], scale: float) -> Proof:

@@ -2,12 +2,18 @@
 as JSON."""
 
 import json
-from collections.abc import Mapping, Sequence
+import multiprocessing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from slviewer.evaluation.render import Row, render
+from slviewer.pipeline.operation import Progress
 from slviewer.records.record import to_plain
+
+PROCESSES = 2
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,20 @@ class Proof:
         )
         constants = {"NaN": None, "Infinity": float("inf")}
         return dict(json.loads(text, parse_constant=constants.get))
+
+
+def judge_all(
+    judge: Callable[..., T], cases: Sequence[tuple[str, tuple[Any, ...]]], progress: Progress
+) -> Iterator[T]:
+    """Yield what ``judge`` returns for the arguments of each case, in their order, from processes
+    of their own; ``cases``: what the progress calls each, and its arguments."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(PROCESSES, spawn) as pool:
+        names, arguments = zip(*cases, strict=True)
+        judged = pool.map(judge, *zip(*arguments, strict=True), chunksize=4)
+        for k, (name, each) in enumerate(zip(names, judged, strict=True)):
+            progress(k / len(cases), name)
+            yield each
 
 
 def prove_checks(

@@ -19,6 +19,7 @@ from slviewer.fringe.presets import PRESETS, bits_for, complementary, gray_bits,
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, Size
 from slviewer.simulation.rig import look_along
 from tests.proofs.hostile_frames import add_crosstalk, compress_jpeg, row_phase, scale_frames
+from tests.proofs.pipelines import LINEAR, PIPELINES, TRUE_OF
 
 CaptureKind = Literal["p18", "complementary", "multifrequency", "heterodyne", "gray", "micro"]
 KINDS: tuple[CaptureKind, ...] = get_args(CaptureKind)
@@ -118,7 +119,8 @@ class CaptureSetup:
     (image, image of which it is a copy). ``gains`` of each image. ``flicker``: depth of bands along
     the rows. ``room_step``: (image from which on a lamp is on, its light as a share of the mean
     grey level). ``clipped_share`` of the illuminated pixels saturated under white, instead of
-    ``exposure``. ``ghost``: share of the image before. ``motion_px`` of the scene in each image,
+    ``exposure``. ``ghost``: share of the image before. ``pipeline``: of `PIPELINES`, empty for a
+    linear camera. ``motion_px`` of the scene in each image,
     along ``direction``. ``reversed``: axes along which the projector's image is mirrored.
     """
 
@@ -144,13 +146,17 @@ class CaptureSetup:
     motion_px: tuple[float, ...] = ()
     direction: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reversed: tuple[Axis, ...] = ()
+    pipeline: str = ""
 
     @property
     def tolerated(self) -> frozenset[str]:
         """Causes that are true of the capture even without a fault."""
         steps = [f.steps for f in self.shown.frames if f.kind == "phase"]
         has_gamma = self.gamma > 1 and steps and min(steps) <= FEW_STEPS
-        return frozenset({"gamma"}) if has_gamma else frozenset()
+        has_gamma = has_gamma or self.pipeline not in ("", LINEAR)
+        return (frozenset({"gamma"}) if has_gamma else frozenset()) | TRUE_OF.get(
+            self.pipeline, frozenset()
+        )
 
     @property
     def displacements(self) -> list[tuple[float, float, float]]:
@@ -163,6 +169,7 @@ class CaptureSetup:
         """The quality in one line."""
         noise = "low" if self.noise == min(NOISES) else "high"
         jpeg = f", JPEG {self.jpeg}" if self.jpeg else ""
+        jpeg += self.pipeline and f", {self.pipeline}"
         return (
             f"{self.view.scene}, {self.view.texture}, gamma {self.gamma:g}, blur"
             f" {self.blur_px:g} px, {noise} noise, {self.bit_depth} bits{jpeg}"
@@ -213,14 +220,16 @@ def gray_code(size: Size, cell_px: float) -> PatternSequence:
     )
 
 
-def draw_setup(kind: CaptureKind, seed: int) -> CaptureSetup:
-    """A sound capture of a kind, of a quality drawn at random."""
+def draw_setup(kind: CaptureKind, seed: int, pipeline: str = "") -> CaptureSetup:
+    """A sound capture of a kind, of a quality drawn at random, seen through a pipeline."""
     rng = np.random.default_rng([seed, crc32(kind.encode())])
     view = _draw_view(rng)
     blur, noise = float(rng.choice(BLURS_PX)), float(rng.choice(NOISES))
     while _measure_contrast(build_sequence(kind, view, blur), view, blur) < LEAST_CONTRAST[noise]:
         blur = max(b for b in (0.0, *BLURS_PX) if b < blur)
     bit_depth = int(rng.choice([8, 8, 10, 12]))
+    if pipeline:
+        bit_depth = 8  # the images' own: the pipeline states it
     full_scale = None if bit_depth == 8 else (1 << bit_depth) - 1
     sequence = replace(build_sequence(kind, view, blur), full_scale=full_scale)
     few = any(f.kind == "phase" and f.steps <= FEW_STEPS for f in sequence.frames)
@@ -228,7 +237,8 @@ def draw_setup(kind: CaptureKind, seed: int) -> CaptureSetup:
     jpeg = 85 if bit_depth == 8 and rng.random() < 0.3 else 0
     ambient, exposure = float(rng.choice([0.0, 0.03, 0.15])), float(rng.uniform(0.6, 0.85))
     return CaptureSetup(
-        kind, seed, view, sequence, sequence, gamma, blur, noise, bit_depth, jpeg, ambient, exposure
+        kind, seed, view, sequence, sequence, gamma, blur, noise, bit_depth, jpeg, ambient,
+        exposure, pipeline=pipeline,
     )  # fmt: skip
 
 
@@ -343,14 +353,16 @@ def _record(setup: CaptureSetup, light: np.ndarray) -> np.ndarray:
     full = (1 << setup.bit_depth) - 1
     rng = np.random.default_rng([setup.seed, crc32(setup.kind.encode()), 3])
     dtype = np.uint8 if setup.bit_depth == 8 else np.uint16
-    out = np.empty(light.shape, dtype)
+    out = np.empty(light.shape, np.float32 if setup.pipeline else dtype)
     relative = setup.noise / 255
     for i, frame in enumerate(light):
         signal = frame * np.float32(gain)
         # half of the standard deviation of full scale remains without light
         variance = relative**2 * (0.25 + 0.75 * np.clip(signal, 0, 1))
         signal = signal + np.sqrt(variance) * rng.standard_normal(signal.shape, np.float32)
-        out[i] = np.clip(np.rint(signal * full), 0, full)
+        out[i] = signal if setup.pipeline else np.clip(np.rint(signal * full), 0, full)
+    if setup.pipeline:
+        return PIPELINES[setup.pipeline](out, rng)
     return compress_jpeg(out, setup.jpeg) if setup.jpeg else out
 
 

@@ -25,6 +25,7 @@ from tests.proofs.captures import (
     prove_captures,
     summarize_cases,
 )
+from tests.proofs.pipelines import PIPELINES
 from tests.proofs.simulated_capture import (
     KINDS,
     CaptureKind,
@@ -214,6 +215,13 @@ def test_beats_beyond_a_projector_that_is_stated_too_small_are_named() -> None:
 
 
 @pytest.mark.computes
+def test_a_phase_that_begins_elsewhere_is_not_named_as_motion() -> None:
+    # vignetting and a gamma hide most of it
+    case = examine_case("offset of a quarter period", "multifrequency", 481109000, "vignette")
+    assert case.outcome == "right", case.text()
+
+
+@pytest.mark.computes
 @pytest.mark.parametrize(
     ("fault", "kind", "seed", "cause"),
     [
@@ -247,3 +255,36 @@ def test_what_few_phase_steps_hide_is_named(
 def test_what_another_cause_imitates_is_named(fault: str, kind: CaptureKind, seed: int) -> None:
     case = examine_case(fault, kind, seed)
     assert case.outcome == ("sound" if fault == NO_FAULT else "right"), case.text()
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize(
+    ("fault", "kind", "pipeline"),
+    [
+        # of few images that come one late, only one shows something else
+        ("frame repeated", "gray", "sharpened"),
+        ("black frame", "micro", "demosaiced"),
+        # a tone curve makes a lamp change the gains too
+        ("lamp switched on", "gray", "sRGB"),
+        # and stripes that blur closes brighter; a line fits the means of two axes
+        (NO_FAULT, "complementary", "vignette"),
+        ("narrow stripes", "gray", "gamma 1.8"),
+    ],
+)
+def test_what_an_ordinary_camera_imitates_is_named(
+    fault: str, kind: CaptureKind, pipeline: str
+) -> None:
+    case = examine_case(fault, kind, 11000, pipeline)
+    assert case.outcome == ("sound" if fault == NO_FAULT else "right"), case.text()
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize("pipeline", PIPELINES)
+def test_pipelines_make_images_of_the_same_places(pipeline: str) -> None:
+    setup = replace(draw_setup("p18", 5, pipeline), noise=0.5, blur_px=0.5, gamma=1.0)
+    capture = render_capture(setup)
+    assert capture.stack.shape == render_capture(replace(setup, pipeline="")).stack.shape
+    decoded = decode_coordinates(setup.described, capture.stack)
+    for axis in setup.shown.axes:
+        difference = decoded[axis] - capture.truth[axis]
+        assert 0 < np.nanmedian(np.abs(difference)) < 0.2

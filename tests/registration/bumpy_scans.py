@@ -10,6 +10,7 @@ from slviewer.registration.scan import prepare_scan
 from slviewer.registration.start import Candidate
 
 CENTRE = np.array([0.0, 0.0, 600.0])
+SIZE = 150.0
 NOISE = 0.03
 POINTS = 12_000
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]

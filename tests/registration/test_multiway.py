@@ -3,7 +3,7 @@ found."""
 
 import numpy as np
 import pytest
-from bumpy_scans import CENTRE, NOISE, bumpy, motion, organised, view
+from bumpy_scans import CENTRE, NOISE, SIZE, bumpy, motion, organised, view
 from facts import raises
 from scipy.spatial.transform import Rotation
 
@@ -193,19 +193,21 @@ def ring(count: int) -> tuple[list[np.ndarray], list[Edge]]:
         for hop in (1, 2):
             other = (k + hop) % count
             T = np.linalg.inv(poses[k]) @ poses[other] @ motion(0.002, 0.004, seed=9 * k + hop)
-            edges.append(Edge(other, k, T, covariance, CENTRE))
+            edges.append(Edge(other, k, T, covariance, CENTRE, SIZE))
     return poses, edges
 
 
 def test_poses_are_as_sure_as_the_pairs_that_lead_there() -> None:
-    sigma, floor = 0.02, graph._FLOOR_MM
+    sigma, floor = 0.02, graph._FLOOR * SIZE
     covariance = np.diag([1e-16] * 3 + [sigma**2] * 3)
     poses = np.stack([motion(0.0, 0.0)] * 4)
-    chain = [Edge(k + 1, k, np.eye(4), covariance, CENTRE) for k in range(3)]
+    chain = [Edge(k + 1, k, np.eye(4), covariance, CENTRE, SIZE) for k in range(3)]
     one = np.sqrt(3 * (sigma**2 + floor**2))
     open_end = [each.shift_mm for each in graph.pose_uncertainties(poses, chain, 1)]
     assert open_end == pytest.approx([one, 0.0, one, np.sqrt(2) * one], rel=1e-3, abs=1e-9)
-    closed = graph.pose_uncertainties(poses, [*chain, Edge(0, 3, np.eye(4), covariance, CENTRE)], 0)
+    closed = graph.pose_uncertainties(
+        poses, [*chain, Edge(0, 3, np.eye(4), covariance, CENTRE, SIZE)], 0
+    )
     assert [each.shift_mm for each in closed] == pytest.approx(
         [0.0, np.sqrt(3 / 4) * one, one, np.sqrt(3 / 4) * one], rel=1e-3, abs=1e-9
     )
@@ -219,7 +221,7 @@ def never(edge: Edge, poses: np.ndarray) -> bool:
 def test_one_bad_edge_among_many_is_dropped() -> None:
     poses, edges = ring(8)
     bad = edges[5]
-    edges[5] = Edge(bad.scan, bad.onto, bad.T @ motion(20.0, 5.0), bad.covariance, bad.centre)
+    edges[5] = Edge(bad.scan, bad.onto, bad.T @ motion(20.0, 5.0), bad.covariance, bad.centre, SIZE)
     kept, dropped = select_consistent_edges(8, edges, 0, never)
     assert list(dropped) == [5] and sorted([*kept, 5]) == list(range(16))
     assert dropped[5][0] > 3.0 and dropped[5][1] == pytest.approx(20.0, abs=0.1)
@@ -233,7 +235,7 @@ def test_of_three_that_contradict_the_surfaces_decide_or_it_is_refused() -> None
     poses, edges = ring(3)
     three = edges[::2]
     bad = three[1]
-    three[1] = Edge(bad.scan, bad.onto, bad.T @ motion(20.0, 5.0), bad.covariance, bad.centre)
+    three[1] = Edge(bad.scan, bad.onto, bad.T @ motion(20.0, 5.0), bad.covariance, bad.centre, SIZE)
     with pytest.raises(SlviewerError):
         select_consistent_edges(3, three, 0, never)
 

@@ -34,6 +34,20 @@ def test_a_known_motion_is_found(deg: float, mm: float) -> None:
     assert result.agreement > 0.98
 
 
+@pytest.mark.parametrize("scale", [0.05, 50.0])
+def test_an_object_of_another_size_is_registered_alike(scale: float) -> None:
+    usual = register(*SCANS)
+    other = register(*(scale * points for points in SCANS))
+    assert other.T_reference_scan[:3, 3] == pytest.approx(
+        scale * usual.T_reference_scan[:3, 3], abs=1e-4 * scale
+    )
+    figures = [
+        (each.overlap, each.agreement, *(mm / size for mm in (each.rms_mm, each.gate_mm)))
+        for each, size in ((usual, 1.0), (other, scale))
+    ]
+    assert figures[1] == pytest.approx(figures[0], rel=1e-3)
+
+
 SCANS = view(bumpy(2), (-45, 75), 1, motion(10, 30)), view(bumpy(2), (-75, 45), 2)
 
 

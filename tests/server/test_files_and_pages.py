@@ -12,6 +12,7 @@ import threading
 import tracemalloc
 import zipfile
 from collections.abc import Iterator
+from importlib import resources
 
 import pytest
 from clocks import HANG_S, until
@@ -26,6 +27,7 @@ from slviewer.server.limits import CONNECTIONS
 from slviewer.server.secure import Serving, serve
 from slviewer.server.text import escape, safe_file_name
 from slviewer.server.zip_stream import open_zip
+from slviewer.session.importers.images import IMAGE_SUFFIXES
 
 PAGE = "<!doctype html><title>projector</title><script>let a = 1</script>"
 
@@ -52,6 +54,13 @@ def test_an_offered_file_arrives_whole(operator, watcher, stranger, tmp_path):
     )
     downloads.clear()
     assert operator.get(address).status == 404
+
+
+def test_the_page_knows_every_image_that_is_imported():
+    script = resources.files("slviewer.server").joinpath("page_script.js").read_text()
+    pattern = re.search(r"const image = /(.*)/i;", script)
+    assert all(re.search(pattern[1], f"pose{suffix}") for suffix in IMAGE_SUFFIXES)
+    assert not re.search(pattern[1], "cloud.ply")
 
 
 def test_an_empty_file_is_a_file(operator, tmp_path):

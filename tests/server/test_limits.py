@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import socket
+import struct
 import threading
 from pathlib import Path
 
@@ -71,6 +72,18 @@ def test_a_request_without_end_is_ended(server, crowd):
         for n in range(2 * REQUEST_BYTES // 1000):
             endless.sendall(f"X-Filler-{n}: {'x' * 1000}\r\n".encode())
     assert until(lambda: not is_open(endless))
+
+
+@pytest.mark.parametrize("upgrade", ["", "Connection: Upgrade\r\nUpgrade: websocket\r\n"])
+def test_who_leaves_before_the_answer_is_no_error_of_the_server(server, crowd, caplog, upgrade):
+    request = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n{upgrade}\r\n"
+    for _ in range(50):
+        (leaving,) = crowd(1, request.encode())
+        # closed with a reset, as by a browser whose tab is closed
+        leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        leaving.close()
+    assert until(lambda: Browser(server, None).get("/").status == 200)
+    assert caplog.text == ""
 
 
 def test_each_role_has_so_many_connections(monkeypatch):

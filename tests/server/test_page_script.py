@@ -89,3 +89,52 @@ def test_batches_that_wait_are_one_and_keep_their_order(
 def test_the_script_runs_before_visers_own() -> None:
     page = client_page()
     assert 0 < page.index(PAGE_SCRIPT) < page.index(b"<script data-p=")
+
+
+NO_WEBGL = """
+const getContext = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...options) {
+  return kind.startsWith("webgl") ? null : getContext.call(this, kind, ...options);
+};
+delete window.WebGLRenderingContext;
+delete window.WebGL2RenderingContext;
+"""
+"""As where the browser's settings forbid it."""
+LANGUAGE_C = """
+Object.defineProperty(Navigator.prototype, "language", { get: () => "C" });
+"""
+"""As of WebKit where the system's locale is C."""
+
+
+def test_without_webgl_what_draws_gets_a_stand_in_and_one_line_says_so(browser: Browser) -> None:
+    page = browser.new_page()
+    page.add_init_script(NO_WEBGL + LANGUAGE_C)
+    page.goto("about:blank")
+    page.add_script_tag(content=PAGE_SCRIPT.decode())
+    drawn = page.evaluate(
+        """() => {
+          const gl = document.createElement("canvas").getContext("webgl2");
+          const program = gl.createProgram();
+          gl.linkProgram(program);
+          const again = document.createElement("canvas").getContext("webgl2");
+          return [gl.getProgramParameter(program, gl.LINK_STATUS), gl.drawArrays(gl.POINTS, 0, 3),
+            gl.getParameter(gl.VERSION), gl === again, gl.canvas.getContext("webgl2") === gl,
+            document.createElement("canvas").getContext("2d") !== null];
+        }"""
+    )
+    assert drawn == [True, None, "WebGL 2.0", False, True, True]
+    assert "WebGL" in page.get_by_role("status").inner_text()  # one line for both canvases
+    assert page.evaluate("new Intl.NumberFormat(navigator.language).format(1.5)") == "1.5"
+    page.close()
+
+
+def test_the_page_is_as_it_is_where_nothing_is_missing(browser: Browser) -> None:
+    page = browser.new_page(locale="de-DE")
+    page.goto("about:blank")
+    page.add_script_tag(content=PAGE_SCRIPT.decode())
+    assert page.evaluate("navigator.language") == "de-DE"
+    assert page.evaluate(
+        "document.createElement('canvas').getContext('webgl2') instanceof WebGL2RenderingContext"
+    )
+    assert page.locator("#no-drawing").count() == 0
+    page.close()

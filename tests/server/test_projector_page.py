@@ -225,6 +225,21 @@ def test_pictures_of_24_bits_are_played_one_a_refresh(opens, channel, projector)
     assert shows(page, render_pattern(SEQUENCE, 0))
 
 
+def test_an_image_is_shown_pixel_by_pixel(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    image = np.random.default_rng(6).integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+    projector.show_image(image)
+    assert np.array_equal(seen(page)[..., ::-1], image)
+    with pytest.raises(DeviceError):
+        projector.show(0)  # it took the place of the sequence
+    with pytest.raises(InputError):
+        projector.show_image(image[1:])
+    projector.load(SEQUENCE)
+    projector.show(0)
+    assert shows(page, render_pattern(SEQUENCE, 0))
+
+
 def test_a_sequence_is_sent_once_and_as_profiles(opens, channel):
     size = (912, 1140)
     opens(size)

@@ -12,8 +12,10 @@ from slviewer.errors import SlviewerError
 from slviewer.registration.open3d_loader import open3d, point_cloud
 from slviewer.session.importers.clouds import ReadCloud, read_cloud, unit_warning
 from slviewer.session.ply import write_ply
-from slviewer.session.shape_files import write_shape
+from slviewer.session.shape_files import describe_loss, write_shape
+from slviewer.session.units import MM
 from slviewer.surface.shapes import PointSet
+from tests.facts import missing_facts
 
 RNG = np.random.default_rng(0)
 POINTS = np.round(RNG.uniform(-50, 50, (300, 3)), 3)
@@ -38,7 +40,7 @@ def write_pcd(path: Path, compressed: bool) -> None:
 
 def write_e57(path: Path) -> None:
     pytest.importorskip("pye57")
-    write_shape(path, PointSet(POINTS, None, COLOURS))
+    write_shape(path, PointSet(POINTS, NORMALS, COLOURS))
 
 
 def write_text_ply(path: Path) -> None:
@@ -55,7 +57,7 @@ def write_text_ply(path: Path) -> None:
         ("t.ply", write_text_ply, False, True),
         ("a.pcd", lambda path: write_pcd(path, False), True, False),
         ("c.pcd", lambda path: write_pcd(path, True), True, False),
-        ("a.e57", write_e57, False, True),
+        ("a.e57", write_e57, True, True),
     ],
 )
 def test_points_normals_and_colours_are_those_of_the_file(
@@ -123,13 +125,15 @@ def test_mesh_with_large_triangles_gets_places_on_them(tmp_path: Path) -> None:
     ("name", "content", "reason"),
     [
         ("a.xyz", "", "three numbers"),
-        ("a.xyz", "1,5 2,5 3,5\n" * 200, "decimal points"),
+        ("a.csv", "1,5,2,5,3,5\n" * 200, "decimal points"),
+        ("a.pts", "300\n" + "1 2 3\n" * 200, "announces 300 points and 200 follow"),
+        ("a.csv", "East;North;Height\n" + "1;2;3\n" * 200, "East, North, Height"),
         ("a.xyz", "1 2 3\n" * 200 + "1 2\n", "truncated"),
         ("a.xyz", "nan nan nan\n" * 200, "all 200 points"),
         ("a.xyz", "1 2 3\n" * 200, "different places"),
         ("a.pcd", "VERSION 0.7\n", "DATA"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 200\nproperty float x\n", "damaged"),
-        ("a.las", "x", r"give \.ply, "),
+        ("a.dxf", "x", r"give \.ply, "),
         ("a.stl", "", "a.stl"),
     ],
 )
@@ -153,9 +157,86 @@ def test_truncated_files_are_refused(tmp_path: Path, name: str) -> None:
         read_cloud(path)
 
 
-def test_points_far_from_the_origin_are_refused(tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "a.xyz", POINTS + 500_000, "%.3f")
-    with pytest.raises(SlviewerError, match="5e\\+05 mm"):
+def test_points_far_from_each_other_are_refused(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "a.xyz", np.append(POINTS, [[500_000, 0, 0]], axis=0), "%.3f")
+    with pytest.raises(SlviewerError, match="5e\\+05 mm across"):
+        read_cloud(tmp_path / "a.xyz")
+
+
+SCALARS = {"temperature": RNG.normal(20, 1, 300), "time": 1.7e9 + RNG.uniform(size=300)}
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "csv"])
+def test_scalars_and_origin_come_back(tmp_path: Path, suffix: str) -> None:
+    """Coordinates as large as a survey's are given back to less than a micrometre, and scalars of
+    double precision and unknown ones as they are."""
+    origin = np.array([694_000_000.0, 5_155_000_000.0, 120_000.0])
+    scalars = SCALARS | {"gaps": np.where(np.arange(300) % 7, 1.5, np.nan).astype(np.float32)}
+    path = tmp_path / f"a.{suffix}"
+    write_shape(path, PointSet(POINTS, NORMALS, COLOURS, origin=origin), scalars=scalars)
+    cloud = read(path)
+    assert np.abs(cloud.points - origin - POINTS.astype(np.float32)).max() < 2e-6
+    assert list(cloud.scalars) == list(scalars)
+    for name, values in scalars.items():
+        assert np.array_equal(cloud.scalars[name], values, equal_nan=True)
+    assert np.array_equal(cloud.colours, COLOURS)
+    assert not cloud.notes
+
+
+def test_formats_that_hold_less_say_so(tmp_path: Path) -> None:
+    shape = PointSet(POINTS, origin=np.array([1e6, 0, 0]))
+    assert not describe_loss(tmp_path / "a.ply", shape, SCALARS)
+    loss = describe_loss(tmp_path / "a.xyz", shape, SCALARS)
+    assert not missing_facts(loss, "temperature", "time", ".csv")
+    assert not missing_facts(describe_loss(tmp_path / "a.glb", shape), "origin 1000000 0 0 mm")
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "unit"),
+    [
+        ("a.csv", "X [m],Y [m],Z [m],T [K]\n", "m"),
+        ("a.csv", "index;x_cm;y_cm;z_cm\n", "cm"),
+        ("a.txt", "x\ty\tz\tt\nm\tm\tm\ts\n", "m"),
+        ("a.xyz", "# units: inches\n", "inch"),
+        ("a.xyz", "// all coordinates in metres\n", "m"),
+        ("a.xyz", "# made in 2 m distance, unit=mm\n", "mm"),
+        ("a.obj", "# File units = centimeters\n", "cm"),
+        ("a.pcd", "# units m\n", "m"),
+        ("a.ply", "comment Unit: meter\n", "m"),
+        ("a.ply", "comment made elsewhere\n", "mm"),
+    ],
+)
+def test_units_that_a_file_states_are_obeyed(
+    tmp_path: Path, name: str, head: str, unit: str
+) -> None:
+    path, points = tmp_path / name, np.round(POINTS / 10, 3)
+    separator = next((each for each in ",;\t" if each in head), " ")
+    columns = 4 if separator != " " else 3
+    table = np.column_stack([np.arange(300) if "index" in head else points[:, 0], points])
+    if "index" not in head:
+        table = np.column_stack([points, points[:, 0]])
+    rows = "".join(separator.join(f"{v:.3f}" for v in row[:columns]) + "\n" for row in table)
+    if name == "a.obj":
+        rows = "".join(f"v {row}\n" for row in rows.splitlines())
+    if name == "a.pcd":
+        head += "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 300\n"
+        head += "HEIGHT 1\nPOINTS 300\nDATA ascii\n"
+    if name == "a.ply":
+        axes = "".join(f"property float {axis}\n" for axis in "xyz")
+        head = f"ply\nformat ascii 1.0\n{head}element vertex 300\n{axes}end_header\n"
+    path.write_text(head + rows)
+    cloud = read(path)
+    assert cloud.unit == unit
+    assert np.abs(cloud.points - MM[cloud.unit] * points).max() < 1e-3
+    given = read_cloud(path, "cm")[1][0]
+    assert given.unit == "cm"
+    if unit != "cm" and "elsewhere" not in head:
+        assert not missing_facts(" ".join(given.notes), f"states {unit}", "in cm")
+
+
+def test_units_that_are_not_read_are_refused(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "a.xyz", POINTS, "%.3f", header="units: micrometers")
+    with pytest.raises(SlviewerError, match=r"um.*--unit"):
         read_cloud(tmp_path / "a.xyz")
 
 

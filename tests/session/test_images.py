@@ -3,14 +3,21 @@
 import errno
 import os
 import struct
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from facts import raises
+from PIL import Image
 
 from slviewer.errors import InputError
-from slviewer.session.importers.images import read_frames, read_image
+from slviewer.session.importers.images import (
+    ORIENTATION_TAG,
+    read_frames,
+    read_image,
+    warn_of_alpha,
+)
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
 FORMATS = [".png", ".jpg", ".bmp", ".tif", ".pgm"]
@@ -44,6 +51,32 @@ def test_cut_short_images_are_refused(tmp_path, suffix, kept):
         read_image(path)
 
 
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+@pytest.mark.parametrize("colours", [1, 3])
+def test_an_image_has_the_sensors_rows_however_the_camera_was_turned(
+    tmp_path: Path, suffix: str, colours: int
+) -> None:
+    pixels = np.kron(np.arange(6, dtype=np.uint8).reshape(2, 3) * 40, np.ones((32, 32), np.uint8))
+    shown = Image.fromarray(pixels if colours == 1 else np.stack([pixels] * 3, axis=-1))
+    for orientation in range(1, 9):
+        exif = Image.Exif()
+        exif[ORIENTATION_TAG] = orientation
+        path = tmp_path / f"{orientation}{suffix}"
+        shown.save(path, exif=exif)
+        read = read_image(path).reshape(*pixels.shape, -1)[..., 0]
+        assert np.abs(read.astype(int) - pixels).max() <= 12, orientation
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+def test_an_alpha_channel_is_left_aside_and_named(tmp_path, suffix):
+    path, plain = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    path.write_bytes(encoded(suffix, np.dstack([PIXELS, PIXELS[::-1], PIXELS, PIXELS // 2])))
+    plain.write_bytes(encoded(suffix))
+    np.testing.assert_array_equal(read_image(path)[..., 1], PIXELS[::-1])
+    (warning,) = warn_of_alpha([plain, path, tmp_path / "absent.png"])
+    assert path.name in warning and "alpha" in warning and plain.name not in warning
+
+
 def test_a_damaged_png_is_refused(tmp_path):
     data = bytearray(encoded(".png"))
     data[len(data) // 2] ^= 1
@@ -69,7 +102,6 @@ def test_a_thumbnail_does_not_end_a_jpeg(tmp_path):
     [
         (PIXELS[:, :60], ("60x48", "a.png", "64x48")),
         (PIXELS.astype(np.uint16) * 257, ("16 bits", "a.png", 8)),
-        (np.dstack([PIXELS] * 4), ("4 channels", "alpha")),
     ],
 )
 def test_frames_that_differ_are_refused(tmp_path, pixels, facts):

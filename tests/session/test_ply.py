@@ -99,7 +99,6 @@ def test_what_is_not_known_is_no_nan_in_the_file(tmp_path: Path) -> None:
         ({"scalars": {"a b": SIGMA}}, ("'a b'", "property")),
         ({"scalars": {"x": SIGMA}}, ("'x'", "property")),
         ({"scalars": {"a": SIGMA[:3]}}, ("a", "(3,)", "50 points")),
-        ({"scalars": {"deviation": np.full(50, np.nan)}}, ("deviation", "50 points")),
         ({"faces": [[0, 1, 50]]}, ("(1, 3)", "below 50")),
         ({"faces": [[0, 1]]}, ("(1, 2)", "(m, 3)")),
     ],

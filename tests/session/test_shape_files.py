@@ -1,8 +1,10 @@
 """What is written for other programs is read back by other programs: as it was, and in its true
 size."""
 
-from importlib.util import find_spec
+import sys
+import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pye57
@@ -12,7 +14,6 @@ from facts import raises
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.registration.open3d_loader import open3d
-from slviewer.session import cad
 from slviewer.session.formats import e57
 from slviewer.session.importers.clouds import read_cloud
 from slviewer.session.shape_files import (
@@ -113,17 +114,44 @@ def test_pye57_reads_points_in_metres_and_their_colours(tmp_path: Path) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["cloud.e57"]
 
 
-@pytest.mark.parametrize(("suffix", "package"), [("3mf", "networkx"), ("e57", "pye57")])
 def test_a_missing_package_is_named_with_its_remedy(
-    tmp_path: Path, suffix: str, package: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def find(name: str) -> object:
-        return None if name == package else find_spec(name)
+    monkeypatch.setattr(e57, "find_spec", lambda name: None)
+    with raises(SlviewerError, "pye57", ".e57", "pip install 'slviewer["):
+        write_shape(tmp_path / "part.e57", POINTS)
 
-    monkeypatch.setattr(e57, "find_spec", find)
-    monkeypatch.setattr(cad, "find_spec", find)
-    with raises(SlviewerError, package, f".{suffix}", "pip install 'slviewer["):
-        write_shape(tmp_path / f"part.{suffix}", MESH if suffix == "3mf" else POINTS)
+
+def test_3mf_is_written_without_other_packages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("lxml", "networkx", "trimesh"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert write_shape(tmp_path / "part.3mf", MESH, notes=("a < b & c",))
+    with zipfile.ZipFile(tmp_path / "part.3mf") as archive:
+        assert not archive.testzip()
+        model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
+    assert len(model.findall(".//{*}triangle")) == len(MESH.faces)
+    assert "a < b & c" in "".join(model.itertext())
+
+
+def test_e57_keeps_the_normals_of_the_points(tmp_path: Path) -> None:
+    assert POINTS.normals is not None
+    write_shape(tmp_path / "cloud.e57", POINTS)
+    _, (cloud,) = read_cloud(tmp_path / "cloud.e57")
+    assert cloud.normals is not None
+    near(cloud.normals, POINTS.normals, 1e-5)
+    near(cloud.points, POINTS.points, 1e-4)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
+def test_normals_point_as_the_triangles_do_of_every_format(tmp_path: Path, suffix: str) -> None:
+    write_shape(tmp_path / f"a.{suffix}", MESH)
+    scene = trimesh.load_scene(tmp_path / f"a.{suffix}", process=False)
+    (found,) = scene.dump()  # as programs show it, its node applied
+    corners = found.vertices[found.faces]
+    winding = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.sum(winding * found.vertex_normals[found.faces[:, 0]], axis=1) > 0).all()
 
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "glb"])

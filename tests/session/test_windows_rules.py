@@ -17,7 +17,7 @@ from slviewer.errors import InputError, SessionError
 from slviewer.session.atomic import replace_file
 from slviewer.session.capture import NewCapture
 from slviewer.session.layout import new_folder
-from slviewer.session.names import new_name, safe_name
+from slviewer.session.names import folder_name, new_name, safe_name
 from slviewer.session.store import Session
 
 
@@ -192,3 +192,21 @@ def test_what_a_console_lacks_is_replaced(monkeypatch) -> None:
     for stream in streams:
         builtins.print("±0.1 → done", file=stream, flush=True)
         assert b"0.1" in stream.buffer.getvalue() and b"done" in stream.buffer.getvalue()
+
+
+def test_a_session_may_have_any_printable_name_that_is_one_folder_everywhere() -> None:
+    assert folder_name("  Müller  Teil 5 😀 ") == "Müller Teil 5 😀"
+    for name in (
+        "a / b",
+        "..",
+        "a\\b",
+        "c:",
+        "what?",
+        "con",
+        "end.",
+        ".hidden",
+        "tab\x00",
+        300 * "x",
+    ):
+        with raises(InputError, *([name] if name in ("a / b", "what?") else [])):
+            folder_name(name)

@@ -11,7 +11,14 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.edit import decimate, drop_small_parts, fill_holes, smooth
 from slviewer.surface.fuse import fuse
 from slviewer.surface.implicit import trim_far_patches, volume_surface
-from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh, grid_mesh, measure_spacing
+from slviewer.surface.meshing import (
+    TRIANGLES_PER_POINT,
+    BuiltMesh,
+    MeshingPlan,
+    build_mesh,
+    grid_mesh,
+    measure_spacing,
+)
 from slviewer.surface.shapes import Mesh, PointSet, analyse_topology, select_faces
 
 pytestmark = pytest.mark.computes
@@ -50,6 +57,19 @@ def test_scans_all_around_close(points: PointSet, closed: BuiltMesh) -> None:
         == []
     )
     assert closed.to_json()["watertight"] is True
+
+
+def test_a_mesh_has_no_more_triangles_than_the_points_hold(
+    points: PointSet, closed: BuiltMesh
+) -> None:
+    plan = MeshingPlan(triangles=10**7, watertight=True)
+    whole = build_mesh(points, plan)
+    most = TRIANGLES_PER_POINT * len(points)
+    assert whole.thinned is None and len(whole.mesh.faces) > most >= len(closed.mesh.faces)
+    assert closed.thinned is not None and closed.thinned.before == len(whole.mesh.faces)
+    # far below the noise, which is 0.03 mm or so
+    assert 0 < closed.thinned.rms_mm < 0.1 * rms(off(points.points))
+    assert missing_facts(closed.text(), f"{closed.thinned.rms_mm:.4f} mm") == []
 
 
 @pytest.mark.slow

@@ -168,7 +168,9 @@ def dark_parts(board: Board, x: np.ndarray, y: np.ndarray, diameter: float) -> n
 
 def _marker_sheet(board: Board) -> np.ndarray:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    ids = np.arange(board.columns * board.rows // 2) + board.first_id
     charuco = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary
+        (board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary, ids
     )
+    charuco.setLegacyPattern(board.legacy)
     return charuco.generateImage((112 * board.columns, 112 * board.rows), marginSize=0)

@@ -51,7 +51,7 @@ def test_odd_lengths_keep_every_digit() -> None:
         ("chessboard:9x2000:9", ("9x2000", 3, "200 rows")),
         ("charuco:8x6:30:0", ("'0'", "length")),
         ("charuco:8x6:30:30", ("30 mm", 0.95, "charuco:8x6:30:22.5")),
-        ("charuco:8x6:30:20:DICT_9X9_50", ("DICT_9X9_50", "4x4", "DICT_5X5_1000")),
+        ("charuco:8x6:30:20:DICT_9X9_50", ("DICT_9X9_50", "DICT_4X4_50", "DICT_5X5_1000")),
         ("charuco:20x20:30:20:DICT_4X4_50", ("200 markers", "DICT_4X4_50", 50)),
     ],
 )

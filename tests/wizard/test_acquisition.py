@@ -13,7 +13,7 @@ from wizard_events import HANG_S, until
 
 from slviewer.devices.capture import CapturedFrames
 from slviewer.devices.protocols import CameraSettings, Rig
-from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.simulated import SimulatedCamera, simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import DeviceError, SessionError
 from slviewer.fringe.presets import short
@@ -134,6 +134,39 @@ def test_a_shutter_that_wears_is_spared() -> None:
         reads = clock.reads
         until(lambda: clock.reads > reads + 4)  # noqa: B023
         assert len(bench.previews) == seen, now_s
+    bench.acquisition.close()
+
+
+def test_still_scenes_and_unseen_previews_are_not_rendered() -> None:
+    clock, world = Clock(), SimulatedWorld(letter(0.1))
+    bench = Bench(clock)
+    bench.rig = simulated_rig(world)
+    bench.open()
+
+    def count(wait_s: float) -> int:
+        """Return how many previews come in so long."""
+        before, reads = len(bench.previews), clock.reads
+        for _ in range(10):
+            clock.now_s += wait_s / 10
+            until(lambda: clock.reads > reads + 4)  # noqa: B023
+            reads = clock.reads
+        return len(bench.previews) - before
+
+    count(1.0)
+    assert count(60.0) == 0
+    world.move(turn_deg=20.0)
+    assert count(1.0) >= 1
+    bench.acquisition.set_light("grey")
+    assert count(1.0) >= 1
+    bench.acquisition.is_followed = True  # its stillness is what hands-free capture waits for
+    assert count(1.0) >= 8
+    bench.acquisition.is_followed = False
+    bench.rig.camera.__class__ = type("OtherCamera", (SimulatedCamera,), {"scene_state": None})
+    assert count(1.0) >= 8
+    bench.acquisition.is_seen = False
+    count(0.1)
+    assert count(4.0) <= 1
+    assert 1 <= count(12.0) <= 3
     bench.acquisition.close()
 
 

@@ -151,3 +151,21 @@ def test_edits_of_several_scans_are_made_and_undone_together(operator: Operator)
         Selection("two", clouds["two"], everything),
     ]
     assert not operator.delete_points(selections, "too much") and counts() == [(1, 0), (2, 0)]
+
+
+def test_all_pending_scans_are_reconstructed_and_one_that_cannot_be_is_named(
+    captured: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(captured, tmp_path / "session")
+    captures = tmp_path / "session" / "captures"
+    shutil.copytree(captures / "one", captures / "three")
+    for chunk in (captures / "two" / "frames.zarr").glob("c.*"):
+        chunk.write_bytes(b"damaged")
+    with Operator(tmp_path / "session") as operator:
+        before = operator.wait_until_idle(HANG_S)
+        assert before.content.pending_scans == ("three", "two")
+        assert operator.reconstruct_all()
+        after = operator.wait_until_idle(HANG_S)
+        assert after.content.pending_scans == ("two",)
+        assert any("two" in each.text and each.level == "warning" for each in after.notices)
+        assert any("1 of 2" in each.text for each in after.notices)

@@ -159,7 +159,7 @@ def test_picked_pairs_start_a_merge(operator: Operator) -> None:
     )
     ply = operator.session.exports / f"merged_{merge.name}.ply"
     content = ply.read_bytes()
-    assert snapshot.next_undo == f"merge: {merge.name}" and operator.undo()
+    assert snapshot.next_undo == f"merge {merge.name}" and operator.undo()
     assert name_of(settled(operator)[1]) == name_of(before) and not ply.exists()
     assert operator.redo() and name_of(settled(operator)[1]) == merge.name
     assert ply.read_bytes() == content

@@ -14,6 +14,7 @@ from facts import missing_facts
 from faulty_rig import FaultyRigs
 from wizard_events import HANG_S, SPARING, last_notice, until, wait_until_open
 
+from slviewer.pipeline.operation import Job
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import PreviewView, Snapshot
@@ -197,7 +198,7 @@ operator.wait_until_idle()
 
 
 @pytest.mark.slow
-def test_hands_free_captures_a_board_that_is_held_still_once(tmp_path: Path) -> None:
+def test_hands_free_captures_a_board_that_is_held_still_and_moves_on(tmp_path: Path) -> None:
     timing = replace(SPARING, previews_per_s=10.0, hold_s=0.2, count_s=0.3)
     previews: list[PreviewView] = []
     with Operator(tmp_path / "session", RIG, timing=timing) as operator:
@@ -214,18 +215,14 @@ def test_hands_free_captures_a_board_that_is_held_still_once(tmp_path: Path) -> 
             and counted
             and all(0 < c <= 0.3 for c in counted)
         )
-        since = len(previews)
-
-        def was_seen_there(for_s: float) -> bool:
-            """Whether the board has been seen where it was captured for so long."""
-            times = [
-                preview.board.time_s for preview in previews[since:] if preview.board is not None
-            ]
-            return len(times) > 5 and times[-1] - times[0] > for_s
-
-        until(lambda: was_seen_there(2 * (timing.hold_s + timing.count_s)))
+        first = captured.world
+        # the simulated board, which nobody holds, moves on to the next place
+        assert operator.wait_for(lambda s: states(s).get("pose_02") == "good", HANG_S)
         assert operator.set_hands_free(False)
-        assert list(states(operator.wait_until_idle())) == ["pose_01"]
+        second = operator.wait_until_idle().world
+        assert first and second
+        moved_mm = second.T_camera_object[:3, 3] - first.T_camera_object[:3, 3]
+        assert np.linalg.norm(moved_mm) > 5
 
 
 def test_a_plane_is_not_captured_while_the_board_is_surely_in_view(operator: Operator) -> None:
@@ -307,3 +304,24 @@ def test_a_session_whose_board_is_of_a_missing_plugin_is_opened_and_says_so(tmp_
         assert operator.choose_target(TARGET)
         view = operator.wait_until_idle().session
         assert view is not None and view.target == TARGET and not view.faults
+
+
+def test_work_that_the_end_of_the_program_interrupted_is_named(tmp_path: Path) -> None:
+    seen = list[str]()
+    with Operator(tmp_path / "session") as operator:
+
+        def work(job: Job) -> str:
+            """Note what the session remembers to run."""
+            seen.append(job.store.decision("running"))
+            return "done"
+
+        operator._work("Testing", work)
+        operator.wait_until_idle()
+        assert seen == ["Testing"] and operator.session is not None
+        assert operator.session.decision("running") is None
+        operator.session.decide("running", "Calibrating")  # as a process that is killed leaves it
+    for notices in (1, 0):
+        with Operator(tmp_path / "session") as operator:
+            texts = [each.text for each in operator.notices() if "interrupted" in each.text]
+            assert len(texts) == notices
+            assert all(missing_facts(text, "Calibrating", "again") == [] for text in texts)

@@ -6,10 +6,12 @@ import threading
 
 import numpy as np
 import pytest
+from facts import missing_facts
 from wizard_events import HANG_S, until
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.gui.widgets import draw_preview
 from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -53,11 +55,8 @@ def test_the_board_is_found_in_the_cameras_pixels() -> None:
     watcher = Watcher(see)
     watcher.watch = Watch(BOARD, nominal_lens(rig.camera.size, 3555.6 * 0.6))
 
-    def offer_again() -> bool:
-        watcher.offer(frame)
-        return arrived.wait(0.05)
-
-    until(offer_again)
+    watcher.offer(frame)  # and no other one: the scene may stay the same
+    assert arrived.wait(HANG_S)
     watcher.close()
     board = found[0].board
     assert board is not None
@@ -132,6 +131,22 @@ def test_brightness_goes_by_the_cameras_range(dtype: type, white: int) -> None:
     assert reduced(frame)[0].dtype == np.uint8
 
 
+def test_what_is_no_image_is_striped_and_its_brightness_does_not_count() -> None:
+    frame = np.full((300, 400), 100, np.uint8)
+    frame[:, :100] = 255  # a bar
+    image = np.indices(frame.shape)[1] >= 100
+    assert brightness(frame)[0] > 0.2
+    saturated, brightest, histogram = brightness(frame, image=image)
+    assert saturated == 0 and brightest == pytest.approx(100 / 255)
+    assert histogram.sum() == pytest.approx(1)
+    grey = np.minimum(frame, 200)
+    preview = PreviewView(1, grey, 1.0, saturated, brightest, histogram, None, "", None, 10.0)
+    plain, striped = draw_preview(preview), draw_preview(preview, image=image)
+    differs = (plain != striped).any(axis=2)
+    quarter = striped.shape[1] // 4
+    assert not differs[:, quarter:].any() and 0.3 < differs[:, :quarter].mean() < 0.7
+
+
 def test_stillness_starts_anew_with_every_movement() -> None:
     still, pixels = Stillness(), np.zeros((5, 2))
     assert still.update(pixels, 1.0, 10.0) == 0
@@ -167,3 +182,33 @@ def test_hands_free_counts_down_once_a_place() -> None:
     assert hands_free.countdown(seen(9, shift=-30, time_s=0.0), False, 6.5) is None
     assert hands_free.countdown(seen(5), False, 7.0) is None
     assert hands_free.countdown(seen(1.5, shift=30), False, 8.0) == 1.0
+
+
+def test_hands_free_names_what_it_waits_for() -> None:
+    hands_free = HandsFree(Timing())
+    hands_free.countdown(None, False, 0)
+    assert hands_free.awaited == ""
+    hands_free.is_on = True
+    for board, busy, facts in (
+        (None, False, ("in view",)),
+        (seen(0.2), False, ("hold",)),
+        (seen(2), False, ("still", "1.0 s")),
+        (seen(2), True, ()),
+    ):
+        hands_free.countdown(board, busy, 1.0)
+        assert missing_facts(hands_free.awaited, *facts) == [] and bool(facts) == bool(
+            hands_free.awaited
+        )
+
+
+def test_hands_free_captures_a_board_that_is_moved_while_it_is_captured() -> None:
+    hands_free = HandsFree(Timing())
+    hands_free.is_on = True
+    hands_free.countdown(seen(2), False, 1.0)
+    due = hands_free.countdown(seen(4), False, 3.0)
+    assert due is not None and due <= 0
+    hands_free.note_capture()
+    assert hands_free.countdown(seen(0.1, shift=30), True, 4.0) is None
+    # the first image after the capture shows the board at its next place
+    assert hands_free.countdown(seen(2, shift=30), False, 5.0) == 1.0
+    assert hands_free.countdown(seen(9), False, 6.0) is None and hands_free.needs_move

@@ -5,6 +5,7 @@ import logging
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from facts import missing_facts
 from test_operator import TARGET, states
@@ -230,6 +231,23 @@ def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(
     now = operator.wait_for(lambda s: s.rig.name == "replay" and s.rig.state != "opening", HANG_S)
     assert now is not None and now.rig.state == "open", now and now.rig.fault
     assert not operator.set_light("dark") and lacks(operator, "dark") == []
+    assert now.rig.projector is not None
+    width, height = now.rig.projector
+    assert not operator.show_image(np.zeros((height, width, 3), np.uint8))
+    assert lacks(operator, "patterns alone", "PNG") == []
+
+
+def test_an_image_is_shown_until_another_light_is_chosen(operator: Operator) -> None:
+    assert operator.wait_for(lambda s: s.rig.state == "open", HANG_S)
+    projector = operator._require_bench().rig.projector
+    width, height = projector.size
+    image = np.zeros((height, width, 3), np.uint8)
+    assert not operator.show_image(image[1:]) and lacks(operator, str(height)) == []
+    assert operator.show_image(image)
+    until(lambda: projector.world.shown.pattern[1] is image)
+    assert operator.wait_for(lambda s: s.rig.light == "image", HANG_S)
+    assert operator.set_light("white")
+    until(lambda: (projector.world.shown.pattern[1] == 255).all())
 
 
 def test_a_diagnostic_bundle_tells_no_password(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from facts import missing_facts
@@ -16,13 +17,15 @@ from slviewer.wizard.pose_plan import PlanInput, PosePlan
 from slviewer.wizard.snapshot import (
     Brightness,
     CalibrationView,
+    CaptureProgress,
+    JobView,
     PoseView,
     RigView,
     ScanView,
     SessionView,
     Snapshot,
 )
-from slviewer.wizard.steps import views
+from slviewer.wizard.steps import STEPS, describe_awaited, list_activities, views
 
 OPEN = RigView(state="open", name="bench", camera=(400, 300), projector=(912, 1140))
 EMPTY = SessionView(Path("s"), "", "complementary")
@@ -116,6 +119,25 @@ def test_the_way_through_the_wizard() -> None:
     )
 
 
+def test_recorded_scans_are_counted_whether_they_are_reconstructed_or_not() -> None:
+    def scan(k: int, cloud: Literal["absent", "fresh", "stale"]) -> ScanView:
+        return ScanView(f"scan_{k}", f"scan {k}", "scan", "", cloud, Reconstruction(), b"")
+
+    scans = (scan(0, "fresh"), scan(1, "stale"), *(scan(k, "absent") for k in range(2, 19)))
+    session = replace(EMPTY, target="circles:9x7:20", calibration=calibration(), scans=scans)
+    assert len(session.pending_scans) == 18
+    plane = ScanView("plane_01", "plane", "scan", "", "absent", Reconstruction(), b"")
+    assert replace(session, scans=(plane,)).pending_scans == ()
+    found = {view.key: view for view in views(seen(session, OPEN))}
+    assert missing_facts(found["scan"].instruction, "19 scans", "1 reconstructed") == []
+    assert found["merge"].state == "blocked"
+    assert missing_facts(found["merge"].blocked_by, "19 scans", "1 is", "reconstruct") == []
+    assert "capture" not in found["merge"].blocked_by
+    alone = replace(session, scans=scans[:1])
+    (merge,) = (view for view in views(seen(alone, OPEN)) if view.key == "merge")
+    assert "another side" in merge.blocked_by
+
+
 def test_a_scan_outside_the_calibrated_depths_leaves_its_step_doubtful() -> None:
     def scan(name: str, outside: float) -> ScanView:
         depths = DepthCheck((400.0, 600.0), outside, 610.0, 700.0, 0.1, True)
@@ -192,3 +214,41 @@ def test_poses_that_cover_the_view_may_still_lack_accuracy() -> None:
     pending = PlanInput(Board.parse("circles:9x7:20"), (400, 300), (912, 1140), {})
     few = replace(lacking, poses=poses(3), plan=planned(False), pending_plan=pending)
     assert missing_facts(views(seen(few, OPEN, None))[2].instruction, "computing", "pose 4") == []
+
+
+def test_next_pose_counts_those_that_are_judged_and_captured() -> None:
+    few = replace(EMPTY, target="circles:9x7:20", poses=poses(2) + poses(1, "judging"))
+    assert missing_facts(views(seen(few, OPEN))[2].instruction, "pose 4") == []
+    capturing = replace(OPEN, capture=CaptureProgress("pose_04", 3, 32, 0))
+    assert missing_facts(views(seen(few, capturing))[2].instruction, "pose 5") == []
+
+
+def test_state_names_what_runs_and_what_is_awaited() -> None:
+    few = replace(EMPTY, target="circles:9x7:20", poses=poses(2))
+    idle = seen(few, OPEN)
+    idle = replace(idle, steps=views(idle))
+    assert list_activities(idle) == []
+    awaited = {key: describe_awaited(idle, key) for key in STEPS}
+    assert all(awaited.values())
+    assert missing_facts(awaited["poses"], "Capture pose") == []
+    assert awaited["calibrate"] == idle.step("calibrate").blocked_by
+    assert describe_awaited(replace(idle, hands_free=True), "poses", "hold it") == "hold it"
+    for rig, fact in ((RigView(), "choose"), (RigView("opening"), "opened")):
+        assert missing_facts(describe_awaited(replace(idle, rig=rig), "poses"), fact) == []
+    job = JobView("Processing pose_02", 0.4, "reading pose_02", 7.2, False, True, 1)
+    capturing = replace(OPEN, capture=CaptureProgress("pose_03", 8, 32, 0))
+    plan = PlanInput(Board.parse("circles:9x7:20"), (400, 300), (912, 1140), {})
+    busy = replace(
+        idle,
+        rig=capturing,
+        job=job,
+        session=replace(few, pending_plan=plan),
+        planning_s=3.0,
+        preparing=0.5,
+    )
+    (capture, share), (work, _), (plan_text, none), (compiling, half) = list_activities(busy)
+    assert missing_facts(capture, "pose_03", 8, 32) == [] and (share, half) == (0.25, 0.5)
+    assert missing_facts(work, "pose_02", "7 s", "1 waiting") == []
+    assert missing_facts(plan_text, "Place board", "3 s") == [] and none is None
+    assert missing_facts(compiling, "50 %") == []
+    assert missing_facts(describe_awaited(busy, "poses"), "grey") == []

@@ -8,7 +8,11 @@ import numpy as np
 
 from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
-from slviewer.calibration.diagnosis.numbering import describe_misnumbering, reconcile_marks
+from slviewer.calibration.diagnosis.numbering import (
+    describe_misnumbering,
+    place_by_neighbours,
+    reconcile_marks,
+)
 from slviewer.calibration.diagnosis.rules import (
     judge_evidence,
     motion_limit_px,
@@ -56,7 +60,7 @@ def calibrate_with_diagnosis(
     the reason; ``camera``: a known one. A calibration that cannot be made is returned with a
     rejecting verdict, not raised.
     """
-    observations, warning = reconcile_marks(board, observations)
+    observations, warning = reconcile_marks(board, place_by_neighbours(observations))
     readable = {o.name: o for o in observations}
     poses = [
         replace(pose, numbering=describe_misnumbering(board, o.points, o.camera))
@@ -101,7 +105,7 @@ def _solve_unchecked(
     projector: tuple[int, int],
     board: Board,
     excluded: Mapping[str, str],
-    camera: KnownCamera | None = None,
+    camera: KnownCamera | None,
 ) -> tuple[StereoModel | None, list[Observation]]:
     """Solve the rig without checks, for diagnosis only.
 

@@ -24,14 +24,13 @@ class Ripple:
     """Ripple of one axis in projector px.
 
     ``rms_px``: RMS of all residuals that repeat with the fringe; ``waves``: waves per period of
-    their strongest component, ``strongest_px`` its RMS; ``noise_px``: predicted noise of one camera
-    pixel, median over the samples; ``mm_per_px``: change of depth by one projector px, in the axis
-    that gives the depth; ``depth_mm``: median depth of the samples.
+    their strongest component; ``noise_px``: predicted noise of one camera pixel, median over the
+    samples; ``mm_per_px``: change of depth by one projector px, in the axis that gives the depth;
+    ``depth_mm``: median depth of the samples.
     """
 
     rms_px: float
     waves: int
-    strongest_px: float
     noise_px: float
     mm_per_px: float
     depth_mm: float
@@ -121,7 +120,7 @@ class SolutionEvidence:
     the largest angle between two boards; ``empty_corners``: corners of the image that the projector
     illuminates and no pose covers; ``aspects``: fy / fx of camera and projector; ``squareness``:
     of the camera's pixels and the board's cells. ``ripple``: residuals that repeat with the fringe,
-    by axis.
+    by axis. ``constant``: the pixels that change in no frame of any pose, "" without any.
     """
 
     used: tuple[str, ...]
@@ -134,6 +133,7 @@ class SolutionEvidence:
     aspects: tuple[float, float]
     ripple: Mapping[Axis, Ripple] = field(default_factory=dict)
     squareness: Squareness | None = None
+    constant: str = ""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.splined.half_turns import opposite_features
+from slviewer.calibration.splined.half_turns import match_features, opposite_features
 from slviewer.geometry.polynomial import monomials, scale_to_unit_square
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import lengths
@@ -16,7 +16,7 @@ from slviewer.target.blobs import detect_blobs
 from slviewer.target.board import Board
 from slviewer.target.images import SEARCH_PX, BoardImage, resize_image
 from slviewer.target.lattice import Lattice, grow_lattices
-from slviewer.target.planar import select_upright, to_image
+from slviewer.target.planar import select_upright, to_image, x_direction
 
 MISNUMBERED_PITCHES = 0.8
 """A residual of this many pitches shows that features are misnumbered."""
@@ -63,12 +63,13 @@ def reconcile_marks(
     """Renumber poses of a board of circles so that all are numbered by its mark, or none; return
     them and a warning.
 
-    A board has a mark in all poses or in none. Marks that only a minority of poses shows are
-    treated as clutter: these poses are renumbered by the rule for boards without a mark
-    (``slviewer.target.planar``). The warning is "" where nothing was changed.
+    A board has a mark in all poses that show it whole, or in none. Marks that only a minority of
+    these shows are treated as clutter: their poses are renumbered by the rule for boards without a
+    mark (``slviewer.target.planar``). The warning is "" where nothing was changed.
     """
     doubtful = [o.name for o in observations if o.marked]
-    if not doubtful or 2 * len(doubtful) >= len(observations):
+    whole = [o for o in observations if _shows_whole(board, o)]
+    if not doubtful or 2 * sum(o.marked for o in whole) >= len(whole):
         return list(observations), ""
     numbered = [_number_by_rule(board, o) if o.marked else o for o in observations]
     warning = (
@@ -79,20 +80,51 @@ def reconcile_marks(
     return numbered, warning
 
 
+def _shows_whole(board: Board, observation: Observation) -> bool:
+    """Return whether a pose shows a board whole, but for features on the image's dead lines."""
+    area = observation.area
+    least = 1.0 if area is None or not len(area.lines) else _FULL_SHARE
+    return len(observation.points) >= least * len(board.points)
+
+
+def place_by_neighbours(observations: Sequence[Observation]) -> list[Observation]:
+    """Renumber poses of which the image's border hides which features they show: as the next pose
+    without such doubt, in order, is turned in the image, else as they are.
+
+    Each place of the board is the same calibration but for the board's unevenness: they are a rigid
+    motion apart.
+    """
+    certain = np.array([k for k, o in enumerate(observations) if o.others is None])
+    placed = list(observations)
+    for k, o in enumerate(observations):
+        if o.others is None or not len(certain):
+            continue
+        beside = observations[certain[np.argmin(np.abs(certain - k))]]
+        wanted = x_direction(beside.points, beside.camera)
+        numberings = [o.points, *o.others]
+        agreement = [x_direction(points, o.camera) @ wanted for points in numberings]
+        placed[k] = replace(o, points=numberings[int(np.argmax(np.round(agreement, 2)))])
+    return placed
+
+
 def _number_by_rule(board: Board, observation: Observation) -> Observation:
     """Renumber an observation by the rule for boards without a mark."""
     partner = opposite_features(board.points)
     plain = replace(observation, marked=False)
-    if partner is None or len(observation.points) != len(board.points):
+    if partner is None:
         return plain
-    same = np.arange(len(board.points))
-    if np.array_equal(select_upright(board, observation.camera, [same, partner]), same):
+    ids, _ = match_features(observation.points, board.points)
+    same, turned = np.full((2, len(board.points)), -1)
+    same[ids] = turned[partner[ids]] = np.arange(len(ids))
+    if select_upright(board, observation.camera, [same, turned]) is same:
         return plain
+    order = turned[turned >= 0]
     return replace(
         plain,
-        camera=plain.camera[partner],
-        projector=plain.projector[partner],
-        slopes=None if plain.slopes is None else plain.slopes[partner],
+        points=board.points[turned >= 0],
+        camera=plain.camera[order],
+        projector=plain.projector[order],
+        slopes=None if plain.slopes is None else plain.slopes[order],
     )
 
 

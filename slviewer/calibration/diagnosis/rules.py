@@ -509,11 +509,25 @@ def _is_focal_unknown(e: Evidence) -> bool:
     return not all(sigma < MAX_FOCAL_SIGMA for sigma in e.solution.focal_sigma.values())
 
 
+def describe_constant_pixels(constant: str) -> Finding:
+    """Return the note on pixels that never change, as `ImageArea.describe` names them."""
+    return Finding(
+        "constant-pixels",
+        "note",
+        f"the light of no frame changes {constant} of the camera's image: this does not count as"
+        " image",
+        "see that neither a mask, a lens hood nor a video's format hides what the camera could"
+        " show, and that its sensor is sound; nothing else needs to be done",
+    )
+
+
 def diagnose_solution(e: Evidence) -> Iterator[Finding]:
-    """Yield findings on corners of the image that no pose covers, on a large reprojection error,
-    and on focal lengths that the poses leave uncertain."""
+    """Yield findings on pixels that never change, on corners of the image that no pose covers, on a
+    large reprojection error, and on focal lengths that the poses leave uncertain."""
     if e.solution is None:
         return
+    if e.solution.constant:
+        yield describe_constant_pixels(e.solution.constant)
     if e.solution.empty_corners:
         where = " and ".join(", ".join(e.solution.empty_corners).rsplit(", ", 1))
         text = f"no pose reaches the {where} of the image, where lenses bend the most"

@@ -13,9 +13,10 @@ import numpy as np
 
 from slviewer.calibration.board_pose import intersect_board, solve_pose
 from slviewer.calibration.diagnosis.evidence import ExcludedPose, Ripple, SolutionEvidence
-from slviewer.calibration.observe import AXES, Observation, Samples
+from slviewer.calibration.observe import AXES, Observation, Samples, combine_observed
 from slviewer.calibration.squareness import measure_squareness
 from slviewer.calibration.stereo import DEVICES, StereoModel
+from slviewer.fringe.image_area import ImageArea
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import fit_polynomial, fit_slopes, grid_points
 from slviewer.geometry.rigid import Floats, Mask, largest_angle_deg, move_points
@@ -24,7 +25,7 @@ from slviewer.geometry.vectors import finite_rows, lengths, rms
 
 CORNERS = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
 CORNER_SHARE = (1 / 4, 1 / 3)
-"""Width and height of a corner region, over those of the image."""
+"""Width and height of a corner region, over those of the part of the image that changes."""
 ILLUMINATED_SHARE = 0.6
 """Least illuminated share of a corner for poses to be requested there."""
 EMPTY_SHARE = 0.3
@@ -46,6 +47,7 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
     """Measure the evidence of a stereo calibration; ``observations``: all, those that the fit
     excluded too."""
     used = [o for o in observations if o.name in stereo.poses]
+    area = combine_observed(observations)
     focal = [np.diag(lens.K)[:2] for lens in (stereo.rig.camera, stereo.rig.projector)]
     normals = np.array([T[:3, 2] * np.sign(T[2, 2] or 1) for T in stereo.poses.values()])
     camera, projector = np.median([stereo.pose_rms_px[o.name] for o in used], axis=0).tolist()
@@ -64,7 +66,8 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
             for device, f in zip(DEVICES, focal, strict=True)
         },
         tilt_spread_deg=largest_angle_deg(normals),
-        empty_corners=list_empty_corners(used, stereo),
+        empty_corners=list_empty_corners(used, stereo, area),
+        constant="" if area is None else area.describe(),
         aspects=(float(focal[0][1] / focal[0][0]), float(focal[1][1] / focal[1][0])),
         ripple=measure_ripple(used, stereo),
         squareness=measure_squareness(
@@ -92,24 +95,30 @@ def measure_excluded(observation: Observation, stereo: StereoModel) -> ExcludedP
     )
 
 
-def list_empty_corners(observations: Sequence[Observation], stereo: StereoModel) -> tuple[str, ...]:
+def list_empty_corners(
+    observations: Sequence[Observation], stereo: StereoModel, area: ImageArea | None = None
+) -> tuple[str, ...]:
     """List the corners of the image that no board covers, among those illuminated at the boards'
-    depths."""
+    depths. ``area``: the part of the image that changes, all of it if None."""
     if stereo.depth_range_mm is None:
         return ()
     size = stereo.rig.camera.size
+    area = area or ImageArea.whole(size)
     covered = np.zeros(size[::-1], bool)
     for o in observations:
         u0, v0, u1, v1 = o.box
         covered[v0:v1, u0:u1] |= o.region
     empty = []
+    u0, v0, u1, v1 = area.bounds
     for name, sides in CORNERS.items():
         along = [
-            ((np.arange(_GRID) + 0.5) / _GRID * share + side * (1 - share)) * n
-            for share, n, side in zip(CORNER_SHARE, size, sides, strict=True)
+            first + ((np.arange(_GRID) + 0.5) / _GRID * share + side * (1 - share)) * n
+            for share, first, n, side in zip(
+                CORNER_SHARE, (u0, v0), (u1 - u0, v1 - v0), sides, strict=True
+            )
         ]
         pixels = grid_points(*along)
-        illuminated = pixels[_is_illuminated(pixels, stereo)]
+        illuminated = pixels[_is_illuminated(pixels, stereo) & area.contains(pixels)]
         if len(illuminated) < ILLUMINATED_SHARE * len(pixels):
             continue
         u, v = np.minimum(np.rint(illuminated).astype(int), np.array(size) - 1).T
@@ -232,11 +241,9 @@ def _fit_ripple(samples: Floats, mm_per_px: float, depth_mm: float) -> Ripple | 
     amplitudes = np.linalg.lstsq(design, residual, rcond=None)[0].reshape(2, MAX_WAVES)
     # less the expectation from independent noise: a variance of 2 s^2 / n in each coefficient
     power = np.maximum(np.sum(amplitudes**2, axis=0) / 2 - 2 * spread**2 / len(residual), 0.0)
-    strongest = int(np.argmax(power))
     return Ripple(
         rms_px=float(np.sqrt(power.sum())),
-        waves=int(waves[strongest]),
-        strongest_px=float(np.sqrt(power[strongest])),
+        waves=int(waves[power.argmax()]),
         # the noise of a block's mean, times the block's side
         noise_px=float(np.median(sigma * samples[:, 5])),
         mm_per_px=mm_per_px,

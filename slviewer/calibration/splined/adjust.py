@@ -2,16 +2,17 @@
 estimated from data."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from threadpoolctl import threadpool_limits
 
-from slviewer.calibration.observe import Observation
+from slviewer.calibration.observe import Observation, combine_observed
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.half_turns import (
     detect_half_turns,
     is_numbering_ambiguous,
+    match_features,
     renumber_poses,
 )
 from slviewer.calibration.splined.held_camera import HeldCamera, HeldLens
@@ -31,10 +32,11 @@ from slviewer.calibration.splined.residual_noise import (
     robust_weights,
 )
 from slviewer.calibration.splined.residuals import PoseData
-from slviewer.calibration.splined.unknowns import State, board_frame
+from slviewer.calibration.splined.unknowns import CELLS_ACROSS, State, board_frame
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
-from slviewer.geometry.rigid import Floats
+from slviewer.fringe.image_area import ImageArea
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.vectors import shared_rms
 
 MIN_POSES = 3
@@ -50,6 +52,8 @@ STRENGTH_STEPS = 3
 """Number of updates of the priors' strengths, which converge after two."""
 MIN_SAMPLES = 3
 """Least number of samples with which a pose has illuminated a cell of a field."""
+MOST_CELLS_FACTOR = 2.0
+"""Of the camera's cells across the image where only a part of it changes."""
 MIN_TRUST = 0.5
 """Least mean robust weight of a pose's features and samples; below, the pose contradicts the
 others."""
@@ -106,22 +110,22 @@ def adjust_bundle(
     """Adjust devices, board and poses jointly, from the observations that the stereo calibration
     used.
 
-    ``cells_across``: cells of each displacement field across its image; by default
-    ``unknowns.CELLS_ACROSS``. ``beside``: an adjustment of the same camera, board and poses with
-    another device, which are held: the projector alone is adjusted. Raises InputError as
-    ``gather_data`` does, and CalibrationRejected where the adjustment does not converge, is
-    undetermined, or where too few poses agree with each other.
+    ``cells_across``: cells of each displacement field across its image, the camera's across the
+    part of it that changes; by default ``unknowns.CELLS_ACROSS``. ``beside``: an adjustment of the
+    same camera, board and poses with another device, which are held: the projector alone is
+    adjusted. Raises InputError as ``gather_data`` does, and CalibrationRejected where the
+    adjustment does not converge, is undetermined, or where too few poses agree with each other.
     """
     names, data, sample_sigma = gather_data(observations, stereo)
     T = np.array([stereo.poses[name] for name in names])
-    state = State.from_rig(stereo.rig, T, len(data.points), cells_across)
+    area = combine_observed(observations)
+    camera_cells = _count_camera_cells(area, cells_across, beside)
+    state = State.from_rig(stereo.rig, T, len(data.points), cells_across, camera_cells)
     layout = state.layout
     state, held, prior = _hold(state, data, stereo, beside, names)
     is_excluded = np.zeros(len(names), bool)
-    marked = {o.name for o in observations if o.marked}
-    certain = np.array(
-        [name in marked or not is_numbering_ambiguous(stereo.board) for name in names]
-    )
+    marked = [o.name for o in observations if o.marked]
+    certain = np.isin(names, marked) | (not is_numbering_ambiguous(stereo.board))
     half_turned = np.zeros(len(names), bool)
     updates, count, damping, moved = 0, 0, 0.0, 0.0
     # more threads gain a tenth, and take many times as long where other work uses the cores
@@ -145,10 +149,9 @@ def adjust_bundle(
             factor = BlockFactor(A, layout)
             count = int(sum(np.count_nonzero(w) for w in weights))
             system = A, b, factor.solve(b)
-            state, residuals, move, damping = _take_step(
-                state, residuals, data, weights, prior, system, damping
-            )
-            before, moved = moved, float(np.sqrt(max(float(move @ b), 0.0) / count))
+            taken = _take_step(state, residuals, data, weights, prior, system, damping)
+            state, residuals, damping = taken.state, taken.residuals, taken.damping
+            before, moved = moved, float(np.sqrt(max(float(taken.move @ b), 0.0) / count))
             if progress:
                 progress(step / (step + 3))
             if moved < NEAR_SIGMAS and updates < STRENGTH_STEPS:
@@ -170,19 +173,8 @@ def adjust_bundle(
         fits = _fit_statistics(
             names, residuals, _sigmas(residuals, noise, sample_sigma, data), data
         )
-        excluded = {
-            name: (
-                f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera,"
-                f" {fits[name].projector_trust:.2f} in the projector): was the board moved during"
-                " the capture?"
-            )
-            for name in np.array(names)[is_excluded].tolist()
-        }
-        pose, _ = data.poses
-        z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
-        z = (z + state.t_board[pose, 2])[~is_excluded[pose]]
-        camera_poses, projector_poses = _count_poses(state, weights[1], data)
-        check = held.release(A, b, factor)
+        camera_poses, projector_poses = _count_poses(state, weights[1], data, area)
+        check = held.release(A, b, factor)  # A has what was held again
         rig_factor = factorize(A)[layout.rig :, layout.rig :]
         return Bundle(
             state=state,
@@ -191,15 +183,50 @@ def adjust_bundle(
             noise=noise,
             strengths=prior.strengths,
             fits=fits,
-            excluded=excluded,
-            depth_range_mm=(float(z.min()), float(z.max())),
+            excluded={
+                name: _explain_exclusion(fits[name])
+                for name in np.array(names)[is_excluded].tolist()
+            },
+            depth_range_mm=_depth_range(state, data, is_excluded),
             camera_poses=camera_poses,
             projector_poses=projector_poses,
             packed_factor=rig_factor[np.tri(len(rig_factor), dtype=bool)].astype(np.float32),
             steps=step,
             half_turned_poses=tuple(np.array(names)[half_turned].tolist()),
             camera=check,
+            area=area,
         )
+
+
+def _explain_exclusion(fit: PoseFit) -> str:
+    """Return why a pose was excluded."""
+    return (
+        f"contradicts the other poses (trust {fit.camera_trust:.2f} in the camera,"
+        f" {fit.projector_trust:.2f} in the projector): was the board moved during the capture?"
+    )
+
+
+def _depth_range(state: State, data: PoseData, is_excluded: Mask) -> tuple[float, float]:
+    """Return the least and the largest depth in mm of the features of the poses that are not
+    excluded, (p,) bool."""
+    pose, _ = data.poses
+    z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
+    z = (z + state.t_board[pose, 2])[~is_excluded[pose]]
+    return float(z.min()), float(z.max())
+
+
+def _count_camera_cells(
+    area: ImageArea | None, cells_across: int | None, beside: Bundle | None
+) -> int:
+    """Return the number of cells across the camera's image, as wide as ``cells_across`` across its
+    ``area`` are; those of the adjustment ``beside``, if there is one."""
+    if beside is not None:
+        return beside.state.rig.camera.coefficients.shape[2] - 3
+    across = CELLS_ACROSS if cells_across is None else cells_across
+    if area is None:
+        return across
+    u0, _, u1, _ = area.bounds
+    return round(across * min(area.size[0] / (u1 - u0), MOST_CELLS_FACTOR))
 
 
 def _hold(
@@ -215,7 +242,7 @@ def _hold(
         held = HeldLens(stereo.known_camera, state.rig.camera, data.sample_px, state.layout.rig)
         return state, held, Prior.build(state, data.points, held.gauge)
     poses = [beside.poses.index(name) for name in names]
-    feature = scipy.spatial.cKDTree(beside.points).query(data.points)[1]
+    feature, _ = match_features(data.points, beside.points)
     own = beside.state
     state = State(
         state.rig._replace(camera=own.rig.camera),
@@ -234,6 +261,16 @@ def _residuals(state: State, data: PoseData) -> ObservedValues:
     return data.feature_px - features, data.projector_px - samples
 
 
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """The state after a step, its residuals, the step, and the damping with which it was taken."""
+
+    state: State
+    residuals: ObservedValues
+    move: Floats
+    damping: float
+
+
 def _take_step(
     state: State,
     residuals: ObservedValues,
@@ -242,34 +279,33 @@ def _take_step(
     prior: Prior,
     system: tuple[Floats, Floats, Floats],
     damping: float,
-) -> tuple[State, ObservedValues, Floats, float]:
+) -> _Step:
     """Take a Gauss-Newton step; damp it where it does not lower the cost.
 
     ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose
     are damped: together with the fields they have a curved valley of the cost at strong distortion.
-    Returns the new state, its residuals, the step, and the damping; the unchanged state where no
-    damping helps.
+    The state is unchanged where no damping helps.
     """
-
-    def cost(state: State, residuals: ObservedValues) -> float:
-        """Return half the weighted sum of squares plus the prior's cost; NaN for invisible ones."""
-        total = 0.0
-        for r, w in zip(residuals, weights, strict=True):
-            used = w > 0
-            total += float(np.sum(w[used] * r[used] ** 2))  # NaN where a step left the view
-        return 0.5 * total + prior.cost(state)
-
     A, b, full = system
-    before = cost(state, residuals)
+    most = _cost(residuals, weights) + prior.cost(state)
     damping = damping / DAMPING_STEP if damping > LEAST_DAMPING else 0.0
     while damping < MOST_DAMPING:
         move = BlockFactor(A, state.layout, damping).solve(b) if damping else full
         after = state.step(move)
         new = _residuals(after, data)
-        if cost(after, new) <= before * (1 + 1e-9):  # False for NaN
-            return after, new, move, damping
+        if _cost(new, weights) + prior.cost(after) <= most * (1 + 1e-9):  # False for NaN
+            return _Step(after, new, move, damping)
         damping = max(DAMPING_STEP * damping, LEAST_DAMPING)
-    return state, residuals, full, damping
+    return _Step(state, residuals, full, damping)
+
+
+def _cost(residuals: ObservedValues, weights: ObservedValues) -> float:
+    """Return half the weighted sum of squares; NaN where a step left the view."""
+    total = 0.0
+    for r, w in zip(residuals, weights, strict=True):
+        used = w > 0
+        total += float(np.sum(w[used] * r[used] ** 2))
+    return 0.5 * total
 
 
 def _remaining(before: float, moved: float) -> float:
@@ -319,8 +355,7 @@ def pose_residuals(
         return None
     i = bundle.poses.index(observation.name)
     points = bundle.numbered_points(observation.name, observation.points)
-    distances, feature = scipy.spatial.cKDTree(bundle.points[:, :2]).query(points[:, :2])
-    known = distances < 1e-3
+    feature, known = match_features(points, bundle.points)
     data = PoseData(
         np.array([0, np.count_nonzero(known)]),
         feature[known],
@@ -342,10 +377,10 @@ def pose_residuals(
 
 
 def _count_poses(
-    state: State, sample_weights: Floats, data: PoseData
+    state: State, sample_weights: Floats, data: PoseData, area: ImageArea | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Count the poses that illuminated each cell (rows, columns) uint16 of the camera's and the
-    projector's field."""
+    projector's field. ``area``: the part of the camera's image that changes."""
     used, count = (sample_weights > 0).all(axis=1), state.layout.poses
     pose = data.poses[1][used]
     counts = []
@@ -355,4 +390,5 @@ def _count_poses(
         extent = [(-0.5, n - 0.5) for n in (count, *device.size[::-1])]
         samples, _ = np.histogramdd((pose, v, u), bins=(count, rows, columns), range=extent)
         counts.append((samples >= MIN_SAMPLES).sum(axis=0, dtype=np.uint16))
-    return counts[0], counts[1]
+    camera, projector = counts
+    return area.fill_outside(camera) if area else camera, projector

@@ -26,6 +26,7 @@ from slviewer.calibration.splined.residuals import (
     sample_row,
 )
 from slviewer.calibration.splined.unknowns import HEIGHT_TERMS, LENS, State
+from slviewer.fringe.image_area import ImageArea
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats, Floats32, Mask
@@ -54,7 +55,8 @@ class Bundle:
     1/px^2: of the camera's and the projector's prior. ``excluded``: poses not used, with the
     reason. ``camera_poses`` and ``projector_poses``: how many poses illuminated each cell of the
     fields (rows, columns). ``half_turned_poses``: poses whose numbering was corrected by half a
-    turn. ``camera``: of one that was held, how the poses agree with it.
+    turn. ``camera``: of one that was held, how the poses agree with it. ``area``: the part of the
+    camera's image that changes, all of it if None.
 
     ``packed_factor``: the lower triangle of ``factor``, row by row, float32.
     """
@@ -73,6 +75,7 @@ class Bundle:
     steps: int
     half_turned_poses: tuple[str, ...] = ()
     camera: CameraCheck | None = None
+    area: ImageArea | None = None
 
     @cached_property
     def factor(self) -> Floats32:

@@ -32,9 +32,9 @@ DEPTHS = 65
 MAX_CORRECTION = 0.02
 """Largest correction over the depth range; beyond it, the coordinate is nearly constant or not
 monotonic in depth."""
-MIN_SLOPE = 0.005
-"""Smallest change of the coordinate with depth, px per mm; below it, the depth noise would be many
-mm."""
+MIN_SLOPE = 3.0
+"""Smallest change of the coordinate, px, over a change of depth as large as the depth; below it,
+noise of 0.03 px would be a hundredth of the depth."""
 _UNSEEN = (np.nan,) * 5
 MARGIN = 0.25
 """Distance beyond the projector's image, over its size, up to which rays are evaluated."""
@@ -199,7 +199,7 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     m00, m01, r0 = s1 - s0, s0 * z0 - s1 * z1, z1 - z0
     m10, m11, r1 = s2 - s0, s0 * z0 - s2 * z2, z2 - z0
     determinant = m00 * m11 - m01 * m10
-    if not (abs(determinant) > 0.0 and abs(s2 - s0) > MIN_SLOPE * abs(z2 - z0)):
+    if not (abs(determinant) > 0.0 and abs(s2 - s0) > MIN_SLOPE * abs(z2 / z0 - 1.0)):
         return _UNSEEN
     c1 = (r0 * m11 - m01 * r1) / determinant
     c2 = (m00 * r1 - r0 * m10) / determinant
@@ -242,11 +242,11 @@ def _tabulate(start, stop, rig, row, centre, near, far, step, grid, projected):
                     s = (pu if row == 0 else pv) - centre
                     change = target - (c0 + c1 * s) / (1.0 + c2 * s)
                     z = min(max(z + change, first), last)
-                    if not abs(change) > 1e-6:
+                    if not abs(change) > 1e-9 * target:
                         break
                 s = (pu if row == 0 else pv) - centre
                 correction = z - (c0 + c1 * s) / (1.0 + c2 * s)
-                settled = abs(change) < 1e-3 or z in (first, last)
+                settled = abs(change) < 2e-6 * target or z in (first, last)
                 if settled and abs(correction) < MAX_CORRECTION * (last - first):
                     grid[j, i, k] = correction
                     projected[j, i, k, 0], projected[j, i, k, 1] = pu, pv

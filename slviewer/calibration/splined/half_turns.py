@@ -10,6 +10,7 @@ numbered from the other end.
 from itertools import pairwise
 
 import numpy as np
+import scipy
 
 from slviewer.calibration.splined.normal import predict_observations
 from slviewer.calibration.splined.residuals import PoseData
@@ -17,7 +18,7 @@ from slviewer.calibration.splined.unknowns import State
 from slviewer.errors import InputError
 from slviewer.geometry.polynomial import monomials, scale_to_unit_square
 from slviewer.geometry.rigid import Floats, Mask
-from slviewer.geometry.vectors import box_middle, finite_rows, lengths, unit_vectors
+from slviewer.geometry.vectors import box_middle, diagonal, finite_rows, lengths, unit_vectors
 from slviewer.target.board import Board
 
 DECISION_SIGMAS = 5.0
@@ -25,7 +26,9 @@ DECISION_SIGMAS = 5.0
 turned."""
 SMOOTH_DEGREE = 4
 """Degree of the polynomials that are removed as possible lens distortion."""
-_STEP_MM = 0.01
+SAME_PLACE = 5e-6
+"""Of a board's diagonal: features so near to each other are one."""
+_STEP = 5e-5  # of that diagonal
 
 
 def is_numbering_ambiguous(notation: str) -> bool:
@@ -44,7 +47,15 @@ def opposite_features(points: Floats) -> np.ndarray | None:
     away = lengths((2 * middle - points)[:, None, :2] - points[None, :, :2])
     partner = np.argmin(away, axis=1)
     is_symmetric = np.array_equal(partner[partner], np.arange(len(points)))
-    return partner if is_symmetric and away.min(axis=1).max() < 1e-3 else None
+    same = SAME_PLACE * diagonal(points)
+    return partner if is_symmetric and away.min(axis=1).max() < same else None
+
+
+def match_features(points: Floats, board: Floats) -> tuple[np.ndarray, Mask]:
+    """Return the index (n,) of the feature of a ``board`` (f, 3) mm that is nearest to each of
+    ``points`` (n, 3) on it, and whether it is the same one, (n,) bool."""
+    distances, feature = scipy.spatial.cKDTree(board[:, :2]).query(points[:, :2])
+    return feature, distances < SAME_PLACE * diagonal(board)
 
 
 def detect_half_turns(state: State, data: PoseData, residuals: Floats, certain: Mask) -> Mask:
@@ -101,11 +112,12 @@ def _measure_offsets(state: State, data: PoseData, residuals: Floats) -> Floats:
     an outlier."""
     # the samples' predictions are not needed
     data = data._replace(sample_from=np.zeros_like(data.sample_from))
+    step = _STEP * diagonal(data.points)
     here, right, below = (
-        predict_observations(state._replace(offsets=state.offsets + step), data)[0]
-        for step in ((0.0, 0.0), (_STEP_MM, 0.0), (0.0, _STEP_MM))
+        predict_observations(state._replace(offsets=state.offsets + moved), data)[0]
+        for moved in ((0.0, 0.0), (step, 0.0), (0.0, step))
     )
-    J = np.stack([right - here, below - here], axis=2) / _STEP_MM  # of px by mm
+    J = np.stack([right - here, below - here], axis=2) / step  # of px by mm
     usable = finite_rows(J.reshape(len(J), -1), residuals)
     usable[usable] &= np.abs(np.linalg.det(J[usable])) > 1e-9
     deviations = np.zeros_like(residuals)

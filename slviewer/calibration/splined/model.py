@@ -4,7 +4,7 @@ uncertainty."""
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
@@ -35,9 +35,9 @@ from slviewer.calibration.splined.unknowns import (
 )
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.errors import InputError
+from slviewer.fringe.image_area import ImageArea
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, Size
-from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Mask, move_points, rigid_transform
@@ -173,9 +173,8 @@ class SplinedModel:
         no target pose illuminated.
         """
         check_map(self.rig.camera.size, phase.phase, "phases")
-        px_per_rad = phase.period_px / (2 * np.pi)
         return self.fast_axis(phase.axis).depth(
-            phase.phase, px_per_rad, self.single_rays, supported
+            phase.phase, phase.px_per_rad, self.single_rays, supported
         )
 
     def support(self, phase: PhaseMap) -> Mask:
@@ -187,9 +186,8 @@ class SplinedModel:
         """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``; NaN where
         points are."""
         check_map(self.rig.camera.size, phase.phase, "phases")
-        px_per_rad = phase.period_px / (2 * np.pi)
-        mm_per_px = self.fast_axis(phase.axis).depth_per_px(phase.phase, px_per_rad)
-        sigma = mm_per_px * np.float32(px_per_rad) * phase.sigma_phase
+        mm_per_px = self.fast_axis(phase.axis).depth_per_px(phase.phase, phase.px_per_rad)
+        sigma = mm_per_px * np.float32(phase.px_per_rad) * phase.sigma_phase
         return np.where(np.isfinite(points[..., 2]), sigma, np.nan).astype(np.float32)
 
     def excess_px(self, axis: Axis) -> float:
@@ -228,7 +226,10 @@ class SplinedModel:
         """Return the figures of the adjustment."""
         bundle, noise = self.bundle, self.bundle.noise
         local = [rms(device.coefficients[:, 1:-1, 1:-1]) for device in self.rig[:2]]
-        lit = [float(np.mean(cells)) for cells in bundle.illuminated]
+        camera, projector = bundle.illuminated
+        if bundle.area is not None:
+            camera = camera[bundle.area.contains_cells(camera.shape)]
+        lit = [float(np.mean(cells)) for cells in (camera, projector)]
         height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
         used = [fit for name, fit in bundle.fits.items() if name not in bundle.excluded]
         return SplinedFit(
@@ -276,13 +277,17 @@ class SplinedModel:
         }
         arrays |= dict(zip(State._fields[1:], own, strict=True))
         arrays |= {name: getattr(bundle, name) for name in _BUNDLE_ARRAYS}
+        if bundle.area is not None:
+            arrays |= bundle.area.to_arrays()
         return arrays | {"R": rig.R, "t": rig.t, "factor": bundle.packed_factor}
 
     @classmethod
     def from_arrays(
         cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> "SplinedModel":
-        """Return the model that ``to_dict`` and ``to_arrays`` saved."""
+        """Return the model that ``to_dict`` and ``to_arrays`` saved. Raises InputError that names
+        an invalid field."""
+        saved = from_plain(data, _SavedModel)
         a = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
         camera, projector = (
             Device(*(a[f"{name}_{key}"] for key in Device._fields)) for name in DEVICES
@@ -290,19 +295,34 @@ class SplinedModel:
         rig = Arrangement(camera, projector, a["R"], a["t"])
         bundle = Bundle(
             state=State(rig, *(a[name] for name in State._fields[1:])),
-            poses=tuple(data["poses"]),
+            poses=saved["poses"],
             **{name: a[name] for name in _BUNDLE_ARRAYS},
-            noise=from_plain(data["noise"], Noise),
-            strengths=tuple(data["strengths"]),
-            fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
-            excluded=data["left_out"],
-            depth_range_mm=tuple(data["depth_range_mm"]),
+            noise=saved["noise"],
+            strengths=saved["strengths"],
+            fits=saved["fits"],
+            excluded=saved["left_out"],
+            depth_range_mm=saved["depth_range_mm"],
             packed_factor=a["factor"],
-            steps=data["steps"],
-            half_turned_poses=tuple(data.get("turned", ())),
-            camera=from_plain(data["camera"], CameraCheck) if "camera" in data else None,
+            steps=saved["steps"],
+            half_turned_poses=saved.get("turned", ()),
+            camera=saved.get("camera"),
+            area=ImageArea.from_arrays(a),
         )
         return cls(bundle)
+
+
+class _SavedModel(TypedDict):
+    """What `SplinedModel.to_dict` returns, without the entries that older versions lack."""
+
+    poses: tuple[str, ...]
+    noise: Noise
+    strengths: tuple[float, float]
+    fits: dict[str, PoseFit]
+    depth_range_mm: tuple[float, float]
+    steps: int
+    left_out: dict[str, str]
+    turned: NotRequired[tuple[str, ...]]
+    camera: NotRequired[CameraCheck]
 
 
 def calibrate_splined(
@@ -346,9 +366,8 @@ def calibrate_projector(
     pixels = np.concatenate([o.projector for o in used])
     seen = finite_rows(pixels)
     # what moved through the volume is one body, with points all over it
-    K, D, (T,), _ = solve_device(
-        "projector", [points[seen]], [pixels[seen]], size, nominal_lens(size)
-    )
-    rig = StereoRig(pair.pinholes.camera, Lens(K, D, size), T[:3, :3], T[:3, 3])
+    solved = solve_device("projector", [points[seen]], [pixels[seen]], size, nominal_lens(size))
+    (T,) = solved.poses
+    rig = StereoRig(pair.pinholes.camera, solved.lens, T[:3, :3], T[:3, 3])
     start = replace(StereoModel.from_rig(rig), poses=poses)
     return SplinedModel(adjust_bundle(used, start, beside=bundle))

@@ -24,11 +24,11 @@ from slviewer.calibration.splined.residuals import (
     sample_row,
 )
 from slviewer.calibration.splined.unknowns import (
-    GAUGE_MM,
+    GAUGE,
     GAUGE_PX,
-    HEIGHT_SIGMA_MM,
+    HEIGHT_SIGMA,
     HEIGHT_TERMS,
-    OFFSET_SIGMA_MM,
+    OFFSET_SIGMA,
     RIG,
     State,
     UnknownLayout,
@@ -38,12 +38,13 @@ from slviewer.calibration.splined.unknowns import (
 from slviewer.errors import CalibrationRejected
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import diagonal
 
 MAX_LANES = 4
 """Largest number of matrices that threads fill in parallel; each has the size of the whole."""
 _ROWS_ADDED = 128  # of two matrices at a time
-POSE_SIGMA = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
-"""rad and mm: holds a pose that was excluded as a whole."""
+POSE_SIGMA = np.array([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])
+"""rad, and over the board's diagonal: holds a pose that was excluded as a whole."""
 FIRST_STRENGTH = 10.0
 """Initial strength of the fields' priors in 1/px^2: displacements of some tenths of a pixel."""
 PROBES = 24
@@ -119,12 +120,14 @@ class Prior:
     ``strengths``), of the board's height and offsets by what boards are like, and of the poses
     widely.
 
-    ``features_per_point``: how many of the board's features each offset of the state represents.
-    ``camera_gauge``: unit rows of what the camera's field lacks, where its lens is held.
-    ``camera_strength``: where the camera's field is held too, what it was calibrated with.
+    ``board_mm``: the diagonal of the board's features. ``features_per_point``: how many of them
+    each offset of the state represents. ``camera_gauge``: unit rows of what the camera's field
+    lacks, where its lens is held. ``camera_strength``: where the camera's field is held too, what
+    it was calibrated with.
     """
 
     forms: tuple[Floats, Floats]
+    board_mm: float
     gauge: Floats
     camera_gauge: Floats | None = None
     strengths: tuple[float, float] = (FIRST_STRENGTH, FIRST_STRENGTH)
@@ -144,22 +147,23 @@ class Prior:
         camera, projector = (roughness(device.coefficients) for device in state.rig[:2])
         strengths = camera_strength or FIRST_STRENGTH, FIRST_STRENGTH
         return cls(
-            (camera, projector), offset_gauge(points), camera_gauge, strengths,
+            (camera, projector), diagonal(points), offset_gauge(points), camera_gauge, strengths,
             camera_strength=camera_strength,
         )  # fmt: skip
 
     def add(self, A: Floats, b: Floats, state: State) -> None:
         """Add to the upper triangle and the right-hand side."""
-        at, diagonal = state.layout, np.arange(len(b))
-        pose = np.tile(POSE_SIGMA**-2.0, at.poses)
-        A[diagonal[: at.height], diagonal[: at.height]] += pose
-        height, offsets = diagonal[at.height : at.offsets], slice(at.offsets, at.rig)
-        A[height, height] += HEIGHT_SIGMA_MM**-2.0
-        b[height] -= state.heights / HEIGHT_SIGMA_MM**2
+        at, order = state.layout, np.arange(len(b))
+        pose = np.tile((POSE_SIGMA * np.repeat([1.0, self.board_mm], 3)) ** -2, at.poses)
+        A[order[: at.height], order[: at.height]] += pose
+        height, offsets = order[at.height : at.offsets], slice(at.offsets, at.rig)
+        sigma = HEIGHT_SIGMA * self.board_mm
+        A[height, height] += sigma**-2
+        b[height] -= state.heights / sigma**2
         form = (
-            np.eye(at.rig - at.offsets) * self.features_per_point / OFFSET_SIGMA_MM**2
-            + self.gauge.T @ self.gauge / GAUGE_MM**2
-        )
+            np.eye(at.rig - at.offsets) * self.features_per_point / OFFSET_SIGMA**2
+            + self.gauge.T @ self.gauge / GAUGE**2
+        ) / self.board_mm**2
         A[offsets, offsets] += form
         b[offsets] -= form @ state.offsets.ravel()
         for first, field, form, strength in self._fields(state):
@@ -174,10 +178,8 @@ class Prior:
 
     def cost(self, state: State) -> float:
         """Half the prior's chi square at a state."""
-        offsets = state.offsets.ravel()
-        total = (
-            np.sum((state.heights / HEIGHT_SIGMA_MM) ** 2) + np.sum(offsets**2) / OFFSET_SIGMA_MM**2
-        )
+        heights, offsets = state.heights / HEIGHT_SIGMA, state.offsets / OFFSET_SIGMA
+        total = (np.sum(heights**2) + np.sum(offsets**2)) / self.board_mm**2
         for _, field, form, strength in self._fields(state):
             total += strength * float(np.sum(field * (field @ form)))
         return 0.5 * float(total)

@@ -24,6 +24,7 @@ from slviewer.calibration.splined.unknowns import (
     undistort_pixel,
 )
 from slviewer.errors import InputError
+from slviewer.fringe.image_area import ImageArea
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats, Floats32, Mask, motion_jacobian
@@ -74,21 +75,27 @@ def working_volume(
     columns: int = 9,
     rows: int = 7,
     depths: int = 5,
+    area: ImageArea | None = None,
 ) -> Volume:
     """Return the points of a regular grid over the camera's image and depths that the projector's
     image contains.
 
     ``calibrated_mm``: nearest and farthest calibrated depth, multiplied by ``DEPTH_FACTORS``;
-    ``columns``, ``rows``, ``depths`` of the grid. Raises InputError for an empty range of depths,
+    ``columns``, ``rows``, ``depths`` of the grid; ``area``: the part of the image that changes, all
+    of it if None. Raises InputError for an empty range of depths,
     and where the projector's image contains no point.
     """
     near, far = (factor * mm for factor, mm in zip(DEPTH_FACTORS, calibrated_mm, strict=True))
     if not 0 < near < far:
         raise InputError(f"calibrated depths {calibrated_mm} mm leave no volume")
     width, height = rig.camera.size
-    u, v = np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows)
+    u0, v0, u1, v1 = area.bounds if area else (0, 0, width, height)
+    u, v = np.linspace(u0, u1 - 1, columns), np.linspace(v0, v1 - 1, rows)
     grid = np.stack(np.meshgrid(u, v, np.linspace(near, far, depths), indexing="ij"), axis=-1)
-    volume = select_visible(rig, grid[..., :2].reshape(-1, 2), grid[..., 2].ravel())
+    grid = grid.reshape(-1, 3)
+    if area is not None:
+        grid = grid[area.contains(grid[:, :2])]
+    volume = select_visible(rig, grid[:, :2], grid[:, 2])
     if not len(volume.z):
         raise InputError(
             f"camera and projector share nothing they both see at {near:.0f}-{far:.0f} mm"
@@ -220,7 +227,7 @@ def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> Si
     The rigid motion removed is that of the working volume's supported points.
     """
     rig = bundle.state.rig
-    reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
+    reference = working_volume(rig, bundle.depth_range_mm, 7, 5, 4, bundle.area)
     motion = BestMotion.fit(reference.points, _select_fitted(bundle, reference))
     jacobian = bundle.point_jacobian(axis, reference.pixels, reference.z)
     moved = bundle.whiten(jacobian) @ motion.weights.astype(np.float32)
@@ -297,7 +304,7 @@ def persistence_ratio(device: Device, illuminated: Mask) -> float:
 def summarise_volume_sigma(bundle: Bundle) -> VolumeSigma:
     """Summarise the 3D uncertainty of the working volume's points."""
     rig = bundle.state.rig
-    volume = working_volume(rig, bundle.depth_range_mm)
+    volume = working_volume(rig, bundle.depth_range_mm, area=bundle.area)
     axis = select_depth_axis(rig, volume)
     fitted = _select_fitted(bundle, volume)
     sigma = volume_sigmas(bundle, axis, volume)

@@ -25,7 +25,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.splines import bending_energy
-from slviewer.geometry.vectors import finite_rows, unit_vectors
+from slviewer.geometry.vectors import diagonal, finite_rows, unit_vectors
 
 CELLS_ACROSS = 26
 """Of any image: half a wavelength of the finest distortion that matters holds two or three
@@ -36,11 +36,12 @@ nothing."""
 HEIGHT_DEGREES = np.array([(i, total - i) for total in (2, 3, 4) for i in range(total, -1, -1)])
 """(12, 2): of the polynomials in x and y."""
 HEIGHT_TERMS = len(HEIGHT_DEGREES)
-HEIGHT_SIGMA_MM = np.array([{2: 0.3, 3: 0.1, 4: 0.05}[i + j] for i, j in HEIGHT_DEGREES.tolist()])
-"""(12,): prior standard deviation of a board's departure from a plane."""
-OFFSET_SIGMA_MM = 0.03
-"""Of a printed feature along x and along y."""
-GAUGE_MM = 1e-6
+HEIGHT_SIGMA = 1 / np.array([{2: 750, 3: 2250, 4: 4500}[i + j] for i, j in HEIGHT_DEGREES.tolist()])
+"""(12,): prior standard deviation of a board's departure from a plane, over its features' diagonal:
+0.3, 0.1 and 0.05 mm at 225 mm."""
+OFFSET_SIGMA = 1 / 7500
+"""Of a printed feature along x and along y: 0.03 mm at 225 mm."""
+GAUGE = 5e-9
 """How nearly the offsets' common shift, turn and growth are held at nothing: the poses and the
 pitch have those."""
 GAUGE_PX = 1e-6
@@ -60,7 +61,7 @@ class Device(NamedTuple):
     size: Floats
 
     @classmethod
-    def from_lens(cls, lens: Lens, cells_across: int | None = None) -> "Device":
+    def from_lens(cls, lens: Lens, cells_across: int | None) -> "Device":
         """Return a lens's device with W = 0, on square cells, ``CELLS_ACROSS`` by default."""
         across = CELLS_ACROSS if cells_across is None else cells_across
         width, height = lens.size
@@ -154,17 +155,21 @@ class State(NamedTuple):
 
     @classmethod
     def from_rig(
-        cls, rig: StereoRig, T: Floats, features: int, cells_across: int | None = None
+        cls,
+        rig: StereoRig,
+        T: Floats,
+        features: int,
+        cells_across: int | None = None,
+        camera_cells: int | None = None,
     ) -> "State":
         """Return the initial state of a rig and poses ``T`` (p, 4, 4), board to camera: no
         displacement, a flat board.
 
         ``cells_across``: cells of each displacement field across its image; by default
-        ``unknowns.CELLS_ACROSS``.
+        ``unknowns.CELLS_ACROSS``. ``camera_cells``: the same of the camera's alone.
         """
-        camera, projector = (
-            Device.from_lens(lens, cells_across) for lens in (rig.camera, rig.projector)
-        )
+        camera = Device.from_lens(rig.camera, camera_cells or cells_across)
+        projector = Device.from_lens(rig.projector, cells_across)
         return cls(
             Arrangement(camera, projector, rig.R.copy(), rig.t.copy()),
             np.ascontiguousarray(T[:, :3, :3]),
@@ -227,7 +232,7 @@ def _step_device(device: Device, numbers: Floats, coefficients: Floats) -> Devic
 def board_frame(points: Floats) -> Floats:
     """(4,) mm: middle x, middle y, half width, half height of the features' rectangle."""
     low, high = points[:, :2].min(0), points[:, :2].max(0)
-    return np.concatenate([(low + high) / 2, np.maximum((high - low) / 2, 1e-3)])
+    return np.concatenate([(low + high) / 2, np.maximum(high - low, 1e-5 * diagonal(points)) / 2])
 
 
 def offset_gauge(points: Floats) -> Floats:

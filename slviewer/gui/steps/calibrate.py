@@ -1,7 +1,8 @@
 """Step 4: calibrate the models from the good poses, and inspect the residuals of poses and
 pixels."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from slviewer.fringe.sequence import Axis
 from slviewer.gui.colouring import DEPTH, paint_points, scan_values
 from slviewer.gui.panel import StepPanel, scan_options
-from slviewer.gui.scene import Click
+from slviewer.gui.scene import Click, Colour
 from slviewer.gui.widgets import (
     PLOT_PX,
     TONES,
@@ -28,6 +29,7 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.pipeline.report import calibration_view
+from slviewer.printable import capitalize
 from slviewer.records.acceptance import ModelComparison
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.report.maps import PixelCurve, pixel_curves, pose_bars, residual_arrows, rms_maps
@@ -127,8 +129,8 @@ class CalibratePanel(StepPanel):
             self._draw_models(calibration, snapshot.is_busy)
         states = ("used", "excluded", "unused")
         names = [pose.name for pose in session.poses if pose.state in states]
-        rms = {name: max(rms) for name, rms in calibration.reprojection.pose_rms_px.items()}
-        self._pose.offer_names(names, max(rms, key=rms.__getitem__, default=""))
+        worst_px = {name: max(px) for name, px in calibration.reprojection.pose_rms_px.items()}
+        self._pose.offer_names(names, max(worst_px, key=worst_px.__getitem__, default=""))
         clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
         self._over.offer({"none": ""} | clouds)
         self._device.offer({text: each for each, text in calibration.reprojection.devices.items()})
@@ -263,9 +265,8 @@ class CalibratePanel(StepPanel):
         self.painter.request(self._arrows.set, (made, name, device), arrows)
 
     def _draw_boards(self, calibration: CalibrationView) -> None:
-        """Draw the poses in 3D, coloured from green to red by reprojection error, the chosen one
-        thick."""
-        stereo, poses = calibration.stereo, self.session.poses
+        """Draw the poses in 3D in the colours of their errors, the chosen one thick."""
+        stereo, splined, poses = calibration.stereo, calibration.splined, self.session.poses
         chosen, covered = self._pose.value, bool(self._over.value)
         states = tuple((pose.name, pose.state) for pose in poses)
         key = (fingerprint(calibration), chosen, covered, states)
@@ -277,17 +278,15 @@ class CalibratePanel(StepPanel):
             return
         outline = Board.parse(stereo.board).outline()
         worst_px = {name: max(px) for name, px in calibration.reprojection.pose_rms_px.items()}
-        usual = np.sqrt(np.mean(np.square([*worst_px.values()] or [1.0])))
+        colours = colour_errors(worst_px, (splined.noise_px if splined else {}).values())
         for pose in poses:
             if pose.T_camera_board is not None and pose.name in worst_px:
-                share = float(np.clip(worst_px[pose.name] / usual - 0.5, 0, 1))
                 here = pose.name == chosen
-                colour = (round(60 + 170 * share), round(170 - 110 * share), 70)
                 self._boards.board(
                     pose.name,
                     pose.T_camera_board,
                     outline,
-                    colour,
+                    colours[pose.name],
                     5.0 if here else 1.5,
                     label=pose.name if here else "",
                 )
@@ -367,21 +366,31 @@ def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:
     )
 
 
+def colour_errors(rms_px: Mapping[str, float], noise_px: Iterable[float]) -> dict[str, Colour]:
+    """Return the colours of poses by their reprojection RMS, px: green up to the median, or the
+    features' noise in one direction where that is more, and red from three times it on."""
+    both = [math.sqrt(2) * px for px in noise_px]  # a feature's error has two directions
+    usual = max([float(np.median([*rms_px.values()])), *both])
+    shares = {name: float(np.clip((px / usual - 1) / 2, 0, 1)) for name, px in rms_px.items()}
+    return {
+        name: (round(60 + 170 * share), round(170 - 110 * share), 70)
+        for name, share in shares.items()
+    }
+
+
 def _summary(calibration: CalibrationView) -> Html:
     """Return a table of the calibration: errors, poses, depths, baseline and models."""
     stereo = calibration.stereo
     properties: dict[str, object] = {
         f"Reprojection RMS, {calibration.reprojection.devices[device]}": coloured(
-            f"{rms:.3f} px", "plain", bold=True
+            f"{rms:.3f} px ({calibration.label})", "plain", bold=True
         )
         for device, rms in calibration.reprojection.rms_px.items()
     }
-    if properties:
-        properties["of the model"] = calibration.label
     depths = stereo.depth_range_mm
     properties |= {
         "Poses used": f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.excluded)}",
-        "Calibrated depths (R2)": "{:.0f} to {:.0f} mm".format(*depths) if depths else None,
+        "Calibrated depths": "{:.0f} to {:.0f} mm".format(*depths) if depths else None,
         "Baseline": f"{stereo.baseline_mm:.2f} mm",
         "Models": ", ".join(calibration.models),
         "Model in use": "none: rejected" if calibration.refused else calibration.best,
@@ -471,14 +480,13 @@ def model_choice_html(calibration: CalibrationView, compared: ModelComparison | 
             "warning",
         )
     if compared is None:
-        why = "default; compare the models to confirm it."
+        why = "by default; compare the models to confirm it."
     elif calibration.recommended in compared.models:
-        why = "smallest error on held-out boards."
+        why = "because its error on held-out boards is the smallest."
     else:
-        why = "default."
-    return paragraph(
-        Html(f"{coloured(calibration.best, 'good', bold=True)} is used: {to_html(why)}")
-    )
+        why = "by default."
+    model = coloured(calibration.best, "good", bold=True)
+    return paragraph(Html(f"The {model} model is used {to_html(why)}"))
 
 
 def _format_finding(finding: Finding) -> str:
@@ -486,14 +494,14 @@ def _format_finding(finding: Finding) -> str:
     text, link = to_html(_capitalise(finding.observation, finding.poses)), help_link(finding.cause)
     if finding.severity == "note":
         return f'<div style="margin-top:0.5em">{coloured("Corrected:", "dim")} {text}. {link}</div>'
-    remedy = coloured(f"{finding.remedy[:1].upper()}{finding.remedy[1:]}.", "plain", bold=True)
+    remedy = coloured(f"{capitalize(finding.remedy)}.", "plain", bold=True)
     return f'<div style="margin-top:0.5em">{text}.<br>→ {remedy} {link}</div>'
 
 
 def _capitalise(text: str, names: Sequence[str] = ()) -> str:
     """Return the text with a capital first letter, unless it begins with a name."""
     named = any(text.startswith(name) for name in names) or text.split(":")[0].count("_")
-    return text if named else text[:1].upper() + text[1:]
+    return text if named else capitalize(text)
 
 
 def _draw_icon(tone: Tone) -> str:

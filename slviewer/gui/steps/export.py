@@ -33,7 +33,7 @@ from slviewer.records.kinds import all_kinds
 from slviewer.session.atomic import format_bytes
 from slviewer.session.report_details import FIELDS, ReportDetails
 from slviewer.session.shape_files import mesh_formats, point_formats, read_mesh_file
-from slviewer.surface.meshing import MeshingPlan, Method
+from slviewer.surface.meshing import TRIANGLES_PER_POINT, MeshingPlan, Method
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import ExportView, SessionView
 
@@ -73,6 +73,9 @@ SMOOTHING = {"none": 0, "light": 5, "strong": 20}
 class MeshInputs(PanelPart):
     """Inputs of a `MeshingPlan`, visible if there is something to mesh."""
 
+    _proposed = 0
+    """Of the number of triangles, which the operator may change."""
+
     def build(self) -> None:
         """Create the inputs."""
         self._method = self.choice(
@@ -80,13 +83,22 @@ class MeshInputs(PanelPart):
         )
         self._holes = self.dropdown("Holes", (SMALL, OPEN, SIZED, CLOSED))
         self._size = self.number("Hole size, mm", 2.0, 0.1, 500.0, 0.1)
-        self._thin = self.number("Triangles", 0, 0, 50_000_000, 1000, "Maximum number; 0: no limit")
+        self._thin = self.number(
+            "Triangles",
+            0,
+            0,
+            50_000_000,
+            1000,
+            "Maximum number; by default twice that of the points",
+        )
         self._smooth = self.choice(
             "Smoothing", "The result states how far the surface was moved", SMOOTHING
         )
 
-    def show(self, visible: bool, merged: bool) -> None:
-        """Show or hide the inputs; merged points have no pixel grid."""
+    def show(self, visible: bool, merged: bool, points: int) -> None:
+        """Show or hide the inputs for a number of points; merged ones have no pixel grid."""
+        if self._thin.value in (0, self._proposed):
+            self._proposed = self._thin.value = TRIANGLES_PER_POINT * points
         self._method.offer(
             {text: name for text, name in METHODS.items() if not (merged and name == "grid")}
         )
@@ -96,8 +108,9 @@ class MeshInputs(PanelPart):
 
     @property
     def triangles(self) -> int | None:
-        """The maximum number of triangles; None: no limit."""
-        return max(4, round(self._thin.value)) if self._thin.value >= 1 else None
+        """The maximum number of triangles; None: that of the operation."""
+        wanted = round(self._thin.value)
+        return None if wanted in (0, self._proposed) else max(4, wanted)
 
     def plan(self) -> MeshingPlan:
         """Return the chosen plan."""
@@ -233,7 +246,8 @@ class ExportPanel(StepPanel):
         """Describe the file of the chosen cloud or mesh, and link it where it exists."""
         session, (what, name) = self.session, self._get_shape()
         mesh = what in MESHES
-        self._mesh.show(mesh and bool(name), what == "merged-mesh")
+        points, model = _points(session, name)
+        self._mesh.show(mesh and bool(name), what == "merged-mesh", points)
         self._shape_format.offer(_name_formats(what))
         chosen = self._shape_format.value
         has_texture = bool(name) and mesh and chosen in TEXTURED_FORMATS
@@ -243,13 +257,13 @@ class ExportPanel(StepPanel):
             self._shape_note.write("Nothing reconstructed yet: scan an object first.", "warning")
             return
         file = _get_export(session, default_file_name(what, name, chosen))
-        points, model = _points(session, name)
         triangles = self._mesh.triangles if mesh else None
         predicted = estimate_file_bytes(what, chosen, points, model, triangles)
         shown_type: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
         text = describe_shape_file(shown_type, points, chosen, None if file else predicted)
         result = self._result_text(file) if file and mesh else ""
-        self._shape_note.set(note(text) + self._link_html(file) + note(result))
+        unseen = note(_describe_view(what, file, chosen))
+        self._shape_note.set(note(text) + self._link_html(file) + note(result) + unseen)
         # a merge's PLY is its own file
         self._write.visible = file is None or what != "merge" or chosen != "ply"
         self._write.label = "Write again" if file else "Write file"
@@ -277,14 +291,14 @@ class ExportPanel(StepPanel):
         what, captured = self._get_shape()
         chosen = self._shape_format.value
         file = None
-        if what in MESHES and chosen in SHOWN_MESHES:
+        if what in MESHES:
             file = _get_export(session, default_file_name(what, captured, chosen))
         written = file.path.stat().st_mtime_ns if file and file.path.exists() else 0
 
         def load() -> trimesh.Trimesh | tuple[np.ndarray, np.ndarray]:
             """Load the mesh, or points (..., 3) mm and colours."""
             store = self.context.session
-            if file and file.bytes < MOST_MESH_BYTES:
+            if file and _is_drawn(file, chosen):
                 mesh = read_mesh_file(file.path)
                 if mesh.visual.kind is None:  # white, which the lights outshine
                     mesh.visual.vertex_colors = _GREY
@@ -302,10 +316,10 @@ class ExportPanel(StepPanel):
     def _draw_cloud(self, made: trimesh.Trimesh | tuple[np.ndarray, np.ndarray]) -> None:
         """Draw a loaded mesh, or a cloud."""
         if isinstance(made, trimesh.Trimesh):
-            self.layer.remove("cloud")
             source = self._source.value
             title = f"mesh of {scan_labels(self.session).get(source, 'merged scans')}"
             self.layer.mesh("mesh", made, title)
+            self.layer.remove("cloud")  # once the mesh is sent, which may take a while
             self.show_points(f"mesh {source}", np.asarray(made.vertices))
             return
         self.layer.remove("mesh")
@@ -394,13 +408,27 @@ class ExportPanel(StepPanel):
         return link(address, words)
 
 
+def _is_drawn(file: ExportView, file_format: str) -> bool:
+    """Return whether the view shows a mesh that was written."""
+    return file_format in SHOWN_MESHES and file.bytes < MOST_MESH_BYTES
+
+
+def _describe_view(what: What, file: ExportView | None, file_format: str) -> str:
+    """Return why the view does not show a mesh that was written; empty where it does."""
+    if what not in MESHES or file is None or _is_drawn(file, file_format):
+        return ""
+    why = f"of {format_bytes(file.bytes)}" if file_format in SHOWN_MESHES else f"as {file_format}"
+    return f"The view shows the points: a mesh {why} is not drawn."
+
+
 def _name_formats(what: What) -> dict[str, str]:
     """Return {name: format} of the files that an export can be written to."""
     return {FORMAT_NAMES.get(each, each.upper()): each for each in formats(what)}
 
 
 def describe_shape_file(what: What, points: int, file_format: str, size_bytes: int | None) -> str:
-    """Describe a file of a scan or merge: its content, units, and approximate size, where known."""
+    """Describe a file of a scan or merge: its content, units, and approximate size, unless it is
+    None."""
     content = {
         "cloud": f"{points:,} points",
         "merge": f"{points:,} merged points",

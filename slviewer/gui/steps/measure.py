@@ -27,7 +27,7 @@ from slviewer.pipeline.measure import MERGED, MeasuredSurface, Place, What
 from slviewer.pipeline.operation import Stored, load_arrays
 from slviewer.records.measurement import Measurement
 from slviewer.report.page import round_up
-from slviewer.session.nominal import MM, Units
+from slviewer.session.units import MM, Units
 from slviewer.wizard.result_views import box_in_view, place_at, point_at, snap
 from slviewer.wizard.snapshot import SessionView
 

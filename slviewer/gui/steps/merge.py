@@ -17,21 +17,28 @@ from slviewer.gui.merge_views import (
     merge_html,
     turntable_html,
 )
-from slviewer.gui.panel import StepPanel, display_name, scan_labels, scan_options
+from slviewer.gui.panel import (
+    ReconstructAllButton,
+    StepPanel,
+    display_name,
+    scan_labels,
+    scan_options,
+)
 from slviewer.gui.point_editing import PointEditing
-from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
 from slviewer.pipeline.merge import StartKind
+from slviewer.records.record import format_count
 from slviewer.wizard.snapshot import ScanView, SessionView
 
 FEATURES, MARKERS, PLACED, TURNTABLE = "features", "markers", "places while scanning", "turntable"
-CURRENT, PICKED = "current position", "picked points"
+CURRENT, PICKED, MACHINE = "current position", "picked points", "machine's poses"
 STARTS: dict[str, StartKind] = {
     FEATURES: "features",
     MARKERS: "markers",
     PLACED: "placed",
     TURNTABLE: "turntable",
     CURRENT: "identity",
+    MACHINE: "machine",
     PICKED: "features",
 }
 """Initial alignments by what they are called here; picked points take the place of features."""
@@ -64,6 +71,7 @@ class MergePanel(StepPanel):
         self._result = Text(gui)
         with gui.add_folder("Scans") as self._scans_folder:
             self._none = Text(gui)
+            ReconstructAllButton(self)
         with gui.add_folder("Alignment") as self._alignment_folder:
             self._reference = self.choice("Reference", "The other scans are moved to it")
             self._start = self.dropdown(
@@ -116,8 +124,11 @@ class MergePanel(StepPanel):
     def _draw_boxes(self, scans: list[ScanView]) -> None:
         """Update the check boxes, one per scan."""
         labels = [scan.label for scan in scans]
-        text = "No reconstructed scan yet: capture two or more in the step Scan."
-        self._none.write("" if scans else text, "warning")
+        recorded = self.session.pending_scans
+        text = "No scan yet: capture two or more in the step Scan."
+        if recorded:
+            text = f"{format_count(len(recorded), 'scan')} not reconstructed yet."
+        self._none.write(text if recorded or not scans else "", "warning")
         for name in self._boxes.keys() - {scan.name for scan in scans}:
             self._boxes.pop(name).remove()
         for scan in scans:
@@ -290,4 +301,4 @@ class MergePanel(StepPanel):
 
 def _list_mergeable(session: SessionView) -> list[ScanView]:
     """List the reconstructed scans of objects, without captured planes and spheres."""
-    return [scan for scan in session.scans if scan.cloud != "absent" and shape_of(scan) == "scan"]
+    return [scan for scan in session.scans if scan.cloud != "absent" and scan.shape == "scan"]

@@ -11,7 +11,7 @@ import viser
 
 from slviewer.calibration.next_pose import GOAL_POSES, Coverage
 from slviewer.gui.capture_inputs import ImportInputs
-from slviewer.gui.panel import RestoreButton, StepPanel
+from slviewer.gui.panel import Confirmation, RestoreButton, StepPanel
 from slviewer.gui.scene import GHOST, Colour
 from slviewer.gui.widgets import (
     Html,
@@ -121,6 +121,7 @@ class PosesPanel(StepPanel):
     _is_counting = False
     _dragged = _sent = 0.0
     _ghost_px: np.ndarray | None = None
+    _image: np.ndarray | None = None
     _world: np.ndarray | None = None
     _target = ""
 
@@ -148,19 +149,22 @@ class PosesPanel(StepPanel):
         )
         self.react(self._hotkey.on_trigger, operator.capture_pose)
         self._hands_free = self.setting(
-            self.checkbox("Hands-free", "Captures whenever the board is held still"),
+            self.checkbox(
+                "Hands-free",
+                "Captures whenever the board is held still; a simulated one moves on by itself",
+            ),
             operator.set_hands_free,
         )
         self._wanted = self.setting(
             self.number(
-                "Sigma, mm",
+                "Precision, mm",
                 0.0,
                 0.0,
                 10.0,
                 0.001,
                 (
-                    "Goal: predicted 3D standard deviation at which no further pose is suggested; "
-                    "0: the default"
+                    "Goal: predicted standard deviation of a measured point at which no further "
+                    "pose is suggested; 0: the default"
                 ),
             ),
             lambda sigma: operator.set_wanted_sigma(float(sigma) or None),
@@ -173,9 +177,10 @@ class PosesPanel(StepPanel):
                 "Exclude": operator.exclude,
                 "Include": operator.include,
                 "Retake": operator.retake_pose,
-                "Delete": operator.delete,
+                "Delete": self._delete,
             }
             self._group = self.button_group("Action", tuple(self._actions), self._request_action)
+            self._question = Confirmation(self)
             self._restore = RestoreButton(self)
         ImportInputs(self, "calibration")
         self._sound = Sound(gui)
@@ -192,7 +197,9 @@ class PosesPanel(StepPanel):
         self._capture.disabled = snapshot.rig.state != "open" or self._board is None
         self._picture.is_large = self.is_ready
         self._place.visible = snapshot.world is not None
-        self._place.disabled = session.suggestion is None or session.pending_plan is not None
+        is_planned = session.suggestion is not None and session.pending_plan is None
+        # a board that is moved while it is captured makes no pose
+        self._place.disabled = not is_planned or snapshot.rig.capture is not None
         self._hands_free.update(snapshot.hands_free)
         self._draw_world(snapshot)
         if session is not self._drawn_session:
@@ -206,6 +213,7 @@ class PosesPanel(StepPanel):
         self._coverage.set(coverage_chart(session.coverage) if session.coverage else "")
         self._draw_accuracy(session)
         self._draw_ghost(session)
+        self._image = session.plan.image if session.plan else None
         self._play_sound(poses, self.snapshot.hands_free)
         self._chosen.offer_names((pose.name for pose in reversed(poses)), follow=True)
         self._chosen.handle.visible = self._group.visible = bool(poses)
@@ -216,7 +224,9 @@ class PosesPanel(StepPanel):
         """Show the live image with the detected board, and the countdown of a hands-free
         capture."""
         is_wanted = self.snapshot.step(self.key).state != "done"
-        self._picture.draw_board(preview, self._board, self._ghost_px, is_wanted=is_wanted)
+        self._picture.draw_board(
+            preview, self._board, self._ghost_px, self._image, is_wanted=is_wanted
+        )
         count = preview.countdown_s
         if count is not None and not self._is_counting:
             self._sound.play("tick")
@@ -350,6 +360,19 @@ class PosesPanel(StepPanel):
             self._actions[action](name)
         else:
             self.context.notify("info", "Capture a pose first.")
+
+    def _delete(self, name: str) -> None:
+        """Request that a pose be deleted, after a question where the calibration uses it."""
+        pose = self.snapshot.pose(name)
+        if pose is None or pose.state != "used":
+            self._operator.delete(name)
+            return
+        self._question.ask(
+            f"The calibration uses {name}. Without it the calibration is out of date, and so are"
+            " the clouds and merges made with it.",
+            f"Delete {name}",
+            partial(self._operator.delete, name),
+        )
 
     def _drag_board(self, T_camera_centre: np.ndarray) -> None:
         """Move the simulated board while its handle is dragged, at most every `_DRAG_S`."""

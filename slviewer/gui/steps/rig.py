@@ -350,7 +350,7 @@ class RigPanel(StepPanel):
     def _set_light(self, name: str) -> None:
         """Request the chosen light; where it is refused, show the current one again."""
         if not self._operator.set_light(LIGHTS[name]):
-            self._light.handle.value = _NAMES[self._operator.snapshot().rig.light]
+            self._light.handle.value = _NAMES.get(self._operator.snapshot().rig.light, "White")
 
 
 class RigCheck(PanelPart):

@@ -21,10 +21,17 @@ from slviewer.gui.colouring import (
     uncertainty,
 )
 from slviewer.gui.live import LiveScreen
-from slviewer.gui.panel import RestoreButton, StepPanel, display_name, scan_labels, scan_options
+from slviewer.gui.panel import (
+    ReconstructAllButton,
+    RestoreButton,
+    StepPanel,
+    display_name,
+    scan_labels,
+    scan_options,
+)
 from slviewer.gui.point_editing import PointEditing, RegionInputs
 from slviewer.gui.scene import Click
-from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
+from slviewer.gui.steps.verify import MUCH_MASKED
 from slviewer.gui.widgets import (
     Html,
     LiveImage,
@@ -40,6 +47,7 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
+from slviewer.printable import capitalize
 from slviewer.records.merge import REPORTED_OUTSIDE, Reconstruction
 from slviewer.records.verification import Verification
 from slviewer.simulation.concave import CONCAVE
@@ -93,6 +101,27 @@ class ScanPanel(StepPanel):
             cuda_device.find_device() is not None,
             operator.use_graphics_card,
         ).visible = cuda_device.is_present()
+        things = ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE)
+        SimulatedObject(self, *things)
+        with gui.add_folder("Capture") as self._capture_folder:
+            self._patterns = self.setting(
+                self.dropdown(
+                    "Patterns",
+                    PRESETS,
+                    "micro for concave metal, wax and other surfaces that light themselves",
+                ),
+                operator.choose_patterns,
+            )
+            ExposureInputs(self, for_scan=True)
+            self._align = self.setting(
+                self.checkbox(
+                    "Align as you scan", "Shows each new scan in its place beside those before it"
+                ),
+                operator.set_align_scans,
+            )
+            self._name = gui.add_text("Name", "", hint="Optional; numbered by default")
+            TurnInputs(self)
+        ReconstructAllButton(self)
         self._gallery = Text(gui)
         with gui.add_folder("Cloud") as self._cloud_folder:
             self._scan = scan = self.choice("Scan")
@@ -132,26 +161,6 @@ class ScanPanel(StepPanel):
                 "Delete scan", lambda: operator.delete(scan.value), "trash",
                 hint="Moves it to the session's trash",
             )  # fmt: skip
-        with gui.add_folder("Capture") as self._capture_folder:
-            self._patterns = self.setting(
-                self.dropdown(
-                    "Patterns",
-                    PRESETS,
-                    "micro for concave metal, wax and other surfaces that light themselves",
-                ),
-                operator.choose_patterns,
-            )
-            ExposureInputs(self, for_scan=True)
-            self._align = self.setting(
-                self.checkbox(
-                    "Align as you scan", "Shows each new scan in its place beside those before it"
-                ),
-                operator.set_align_scans,
-            )
-            self._name = gui.add_text("Name", "", hint="Optional; numbered by default")
-            TurnInputs(self)
-            things = ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE)
-            SimulatedObject(self, *things)
         self._restore = RestoreButton(self)
         ImportInputs(self, "scan")
 
@@ -272,7 +281,7 @@ class ScanPanel(StepPanel):
         shown = len(self._shown_scans())
         suffix = "" if shown == 1 else f", {shown} scans"
         self._support.label = f"Remove support{suffix}"
-        self._support.disabled = busy or is_absent or shape_of(scan) != "scan"
+        self._support.disabled = busy or is_absent or scan.shape != "scan"
         frame = self.context.offer_frame(scan.name)
         self._gallery.set(gallery(sort_scans(self.session.scans), scan.name, frame))
         if self._is_live:
@@ -468,7 +477,7 @@ def scan_html(scan: ScanView) -> Html:
             "Much is not supported: capture target poses at the object's place.", "warning"
         )
     tone: Tone = "dim" if figures.is_good else "warning"
-    html += "".join(alert(f"{text[:1].upper()}{text[1:]}.", tone) for text in figures.list_notes())
+    html += "".join(alert(f"{capitalize(text)}.", tone) for text in figures.list_notes())
     if scan.cloud == "stale":
         html += note("Made with an older calibration: reconstruct it again.", "warning")
     return html
@@ -477,7 +486,7 @@ def scan_html(scan: ScanView) -> Html:
 def sort_scans(scans: Sequence[ScanView]) -> list[ScanView]:
     """Sort scans of objects first, then captures of planes and spheres; the newest of each
     first."""
-    return sorted(reversed(scans), key=lambda scan: shape_of(scan) != "scan")
+    return sorted(reversed(scans), key=lambda scan: scan.shape != "scan")
 
 
 def gallery(scans: Sequence[ScanView], chosen: str, frame: str) -> Html:

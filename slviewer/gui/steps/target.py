@@ -1,5 +1,6 @@
 """Step 2: choose the board, print it, and check that it is detected."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,17 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.gui.panel import StepPanel
 from slviewer.gui.widgets import Html, LiveImage, Text, alert, coloured, link, paragraph, to_html
+from slviewer.pipeline.detect import recognise_target
 from slviewer.pipeline.printouts import target as write_target
-from slviewer.target.board import EXAMPLES, LEGACY, Board, board_examples, plugin_boards
+from slviewer.target.board import (
+    DICTIONARIES,
+    EXAMPLES,
+    LEGACY,
+    Board,
+    board_examples,
+    plugin_boards,
+)
+from slviewer.target.detect import RecognisedBoard
 from slviewer.wizard.snapshot import PreviewView
 
 KINDS = {
@@ -18,9 +28,6 @@ KINDS = {
     "ChArUco": "charuco",
     "ChArUco before OpenCV 4.6": LEGACY,
 }
-DICTIONARIES = tuple(
-    f"DICT_{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)
-)
 _EXPLANATIONS = {
     "circles": "Circles per row and column; pitch: distance of their centres",
     "acircles": "Circles per row, number of rows; pitch: half the distance of neighbours in a row",
@@ -36,6 +43,8 @@ class TargetPanel(StepPanel):
     _target = ""
     _board: Board | None = None
     _folder: Path | None = None
+    _requests = 0
+    _examined: tuple[Path, int, int] | None = None
 
     def build(self) -> None:
         """Create the fields of the board, and the live image."""
@@ -50,13 +59,19 @@ class TargetPanel(StepPanel):
         differs = "Along the columns, where the print differs there; 0: the same"
         self._pitch_y = self.number("Pitch y, mm", 0.0, 0.0, 1000.0, 0.01, differs)
         self._marker = self.number("Marker, mm", 1.0, 0.1, 1000.0, 0.01)
-        self._dictionary = self.dropdown("Dictionary", DICTIONARIES)
+        self._dictionary = self.dropdown("Dictionary", tuple(DICTIONARIES))
+        self._first_id = self.number("First id", 0, 0, 2400, 1)
         self._use = self.button(
             "Use this board",
             lambda: self._operator.choose_target(str(self._parse_entered())),
             "check",
             None,
         )
+        self._recognise = self.button(
+            "Recognise board", lambda: self._request_recognition(True), "scan",
+            hint="Examines the pictures of the target poses; the pitch is yours to enter",
+        )  # fmt: skip
+        self._recognised = Text(gui)
         self.button("Create PDF", self._write_sheet, "printer", hint="To print the board to scale")
         self._sheet = Text(gui)
 
@@ -72,7 +87,13 @@ class TargetPanel(StepPanel):
             self._board = Board.parse(self._target) if self._target else None
             if self._board:
                 self._fill_fields(self._board)
-        self._marker.visible = self._dictionary.visible = "charuco" in self._kind.value
+        self._recognise.visible = bool(session.poses)
+        if not session.poses:
+            self._recognised.set("")
+        elif not session.target and not self.snapshot.is_busy:
+            self._request_recognition(False)
+        for field in (self._marker, self._dictionary, self._first_id):
+            field.visible = "charuco" in self._kind.value
         try:
             board = self._parse_entered()
         except InputError as error:
@@ -90,6 +111,32 @@ class TargetPanel(StepPanel):
         )
         self._note.set(paragraph(Html(f"{explanation}<br>{state}")))
 
+    def _request_recognition(self, again: bool) -> None:
+        """Request that the board in the poses be recognised, once for each number of them unless
+        ``again``."""
+        self._requests += again
+        key = (self.session.folder, len(self.session.poses), self._requests)
+        store = self.context.session
+        if key != self._examined:
+            self._examined = key
+            self._recognised.write("Examining the pictures of the poses for the board.", "dim")
+        self.painter.request(self._show_recognised, key, lambda: recognise_target(store))
+
+    def _show_recognised(self, found: RecognisedBoard | None) -> None:
+        """Fill in the recognised board, with the pitch that was entered."""
+        if found is None:
+            text = "No board was recognised in the poses: enter kind, columns and rows."
+            self._recognised.write(text, "warning")
+            return
+        board, pitch = found.board, self._pitch.value
+        self._fill_fields(replace(board, pitch_mm=pitch, pitch_y_mm=pitch))
+        self._recognised.write(
+            f"{found.text()}. No picture shows its pitch: measure and enter it, then use the"
+            " board.",
+            "info",
+        )
+        self.redraw()
+
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image with the detected board."""
         self._picture.draw_board(preview, self._board, is_wanted=not self.session.good_poses)
@@ -103,6 +150,7 @@ class TargetPanel(StepPanel):
         notation += f"x{along_y:g}" if along_y else ""
         if "charuco" in kind:
             notation += f":{self._marker.value:g}:{self._dictionary.value}"
+            notation += f":{int(self._first_id.value)}"
         return Board.parse(notation)
 
     def _fill_fields(self, board: Board) -> None:
@@ -113,6 +161,7 @@ class TargetPanel(StepPanel):
         self._pitch_y.value = 0.0 if board.pitch_y_mm == board.pitch_mm else board.pitch_y_mm
         if board.kind == "charuco":
             self._marker.value, self._dictionary.value = board.marker_mm, board.dictionary
+            self._first_id.value = board.first_id
 
     def _fill_example(self) -> None:
         """Fill the fields with an example of the chosen kind of board."""

@@ -25,7 +25,7 @@ from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
 from slviewer.report.page import Figure
 from slviewer.wizard import result_views
-from slviewer.wizard.snapshot import PreviewView, ScanView
+from slviewer.wizard.snapshot import PreviewView
 
 _Painted = tuple[result_views.ScanCloud, np.ndarray, Html]
 """A cloud, its colours, and their legend."""
@@ -111,7 +111,7 @@ class VerifyPanel(StepPanel):
             }
         )
         for shape, button in self._all.items():
-            self._waiting[shape] = [scan.name for scan in waiting if shape_of(scan) == shape]
+            self._waiting[shape] = [scan.name for scan in waiting if scan.shape == shape]
             n = len(self._waiting[shape])
             button.visible, button.label = n > 1, f"Measure all {n} {shape}s"
         results = {row.name: row for row in rows}
@@ -171,11 +171,3 @@ class VerifyPanel(StepPanel):
         names = self._waiting[shape] if every else [self._recorded.value]
         if any(names):
             self._operator.verify(names, shape, **self._inputs.values())
-
-
-def shape_of(scan: ScanView) -> str:
-    """Return "plane", "sphere" or "scan": a capture's purpose, or what the name of a recorded one
-    suggests."""
-    if scan.purpose != "scan":
-        return scan.purpose
-    return next((shape for shape in _ICONS if scan.name.lower().startswith(shape)), "scan")

@@ -1,18 +1,31 @@
-"""E57: binary, ASTM E2807, in metres, points and their colours (`pip install 'slviewer[e57]'`)."""
+"""E57: binary, ASTM E2807, in metres, points with colours and normals (`pip install
+'slviewer[e57]'`)."""
 
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.session.atomic import arriving_path
-from slviewer.session.ply import COLOURS, PLACE, to_ascii
-from slviewer.session.shape_format import Columns, Shape, ShapeFormat, Sizes
+from slviewer.session.columns import SENSOR, Columns
+from slviewer.session.ply import replace_nan, to_ascii
+from slviewer.session.shape_format import Shape, ShapeFormat, Sizes, split_shape
 from slviewer.surface.shapes import Mesh
 
-_SIZES = Sizes(4000, 12, 3)
+_SIZES = Sizes(4000, 24, 3)
+_PLACE = ("cartesianX", "cartesianY", "cartesianZ")
+_COLOURS = ("colorRed", "colorGreen", "colorBlue")
+_NORMAL = ("nor:normalX", "nor:normalY", "nor:normalZ")
+_NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
+"""The extension of the standard that names normals."""
+_LARGEST = float(np.finfo(np.float32).max)
+_POLAR = {"sphericalRange", "sphericalAzimuth", "sphericalElevation"}
+_STATES = {"cartesianInvalidState", "isColorInvalid"}
+"""Fields by which pye57 leaves points out."""
 
 
 def _require_package(path: Path) -> None:
@@ -24,24 +37,98 @@ def _require_package(path: Path) -> None:
 
 
 def _write(path: Path, shape: Shape, scalars: Columns, notes: Sequence[str]) -> None:
+    """Write one scan: places as float32, far from the origin as float64, colours, and normals by
+    the extension for them. pye57 itself writes no normals."""
     _require_package(path)
     import pye57
+    from pye57 import libe57
 
     assert not isinstance(shape, Mesh)
-    x, y, z = 1e-3 * shape.points.T.astype(np.float64)
-    fields = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
-    if shape.colours is not None:
-        fields |= dict(zip(("colorRed", "colorGreen", "colorBlue"), shape.colours.T, strict=True))
-    size = _SIZES.estimate(len(x), 0, colours=shape.colours is not None, scalars=0)
+    places, _ = split_shape(shape)
+    points = (1e-3 * places.astype(np.float64)).astype(places.dtype)
+    count, colours = len(points), shape.colours
+    columns = dict(zip(_PLACE, points.T, strict=True))
+    if colours is not None:
+        columns |= dict(zip(_COLOURS, colours.T, strict=True))
+    if shape.normals is not None:
+        normals = replace_nan("nx", shape.normals).astype(np.float32)
+        columns |= dict(zip(_NORMAL, normals.T, strict=True))
+    size = _SIZES.estimate(count, 0, colours=colours is not None, scalars=0)
     with arriving_path(path, size) as arriving:
         file = pye57.E57(str(arriving), mode="w")
         try:
-            file.write_scan_raw(fields, name=to_ascii(notes[0]) if notes else None)
+            image = file.image_file
+            image.extensionsAdd("nor", _NORMALS_URI)
+            prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+            for name, values in columns.items():
+                if values.dtype == np.uint8:
+                    node = libe57.IntegerNode(image, 0, 0, 255)
+                elif values.dtype == np.float64:
+                    node = libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE)
+                else:
+                    node = libe57.FloatNode(image, 0.0, libe57.E57_SINGLE, -_LARGEST, _LARGEST)
+                prototype.set(name, node)
+                columns[name] = values = np.ascontiguousarray(values)
+                buffers.append(libe57.SourceDestBuffer(image, name, values, count, True, True))
+            scan = libe57.StructureNode(image)
+            file.data3d.append(scan)
+            scan.set("guid", libe57.StringNode(image, f"{{{uuid4()}}}"))
+            scan.set("name", libe57.StringNode(image, to_ascii(notes[0]) if notes else "cloud"))
+            _set_limits(image, scan, "cartesianBounds", libe57.FloatNode, points, "xyz")
+            if colours is not None:
+                ends = np.repeat([[0], [255]], 3, axis=1)
+                _set_limits(image, scan, "colorLimits", libe57.IntegerNode, ends, _COLOURS)
+            vector = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+            scan.set("points", vector)
+            writer = vector.writer(buffers)
+            writer.write(count)
+            writer.close()
         finally:
             file.close()
 
 
-def _read(path: Path, data: bytes) -> list[Columns]:
+def _set_limits(
+    image: Any, scan: Any, name: str, kind: Any, values: np.ndarray, columns: Sequence[str]
+) -> None:
+    """Write the smallest and the largest of each column of ``values`` (n, k) to the scan's entry
+    ``name``; ``kind``: of libe57's nodes."""
+    from pye57 import libe57
+
+    node = libe57.StructureNode(image)
+    for column, smallest, largest in zip(
+        columns, values.min(axis=0), values.max(axis=0), strict=True
+    ):
+        node.set(f"{column}Minimum", kind(image, smallest.item()))
+        node.set(f"{column}Maximum", kind(image, largest.item()))
+    scan.set(name, node)
+
+
+def _read_others(file: Any, header: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return fields of a scan that pye57 does not read, of the points that are valid; normals in
+    the file's frame."""
+    from pye57 import libe57
+
+    states = [each for each in header.point_fields if each.endswith("InvalidState")]
+    arrays = {name: np.empty(header.point_count) for name in (*names, *states)}
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, array in arrays.items():
+        buffers.append(
+            libe57.SourceDestBuffer(file.image_file, name, array, len(array), True, True)
+        )
+    header.points.reader(buffers).read()
+    valid = np.ones(header.point_count, bool)
+    for state in states:
+        valid &= arrays.pop(state) == 0
+    arrays = {name.rpartition(":")[2]: values[valid] for name, values in arrays.items()}
+    if header.has_pose() and set(_NORMAL) <= set(names):
+        axes = [name.rpartition(":")[2] for name in _NORMAL]
+        normals = np.stack([arrays[axis] for axis in axes], axis=1)
+        normals = file.to_global(normals, header.rotation, np.zeros(3))
+        arrays |= dict(zip(axes, normals.T, strict=True))
+    return arrays
+
+
+def _read(path: Path, data: bytes, notes: list[str]) -> list[Columns]:
     """Return the columns of each scan in one frame, and its scanner's place."""
     _require_package(path)
     import pye57
@@ -52,10 +139,10 @@ def _read(path: Path, data: bytes) -> list[Columns]:
             header = file.get_header(i)
             # transformed into the file's frame, in which the header states the scanner's place
             values = file.read_scan(i, colors=True, transform=True, ignore_missing_fields=True)
-            fields = [(f"cartesian{each.upper()}", each) for each in PLACE]
-            fields += [(f"color{each.title()}", each) for each in COLOURS]
-            columns = {ours: values[theirs] for theirs, ours in fields if theirs in values}
-            scans.append(columns | ({"sensor": header.translation} if header.has_pose() else {}))
+            used = values.keys() | _STATES | _POLAR
+            others = [name for name in header.point_fields if name not in used]
+            values |= _read_others(file, header, others) if others else {}
+            scans.append(values | ({SENSOR: header.translation} if header.has_pose() else {}))
     finally:
         file.close()
     if not scans:
@@ -65,7 +152,7 @@ def _read(path: Path, data: bytes) -> list[Columns]:
 
 FORMAT = ShapeFormat(
     "e57",
-    "metres, as E57 demands; with colours",
+    "metres, as E57 demands; with colours and normals",
     _SIZES,
     _write,
     takes_points=True,

@@ -66,10 +66,11 @@ def encode_glb(shape: Shape, notes: Sequence[str], texture: Any = None) -> bytes
 
 FORMAT = ShapeFormat(
     "glb",
-    "metres, as glTF demands, so that programs show the true size; with colours",
+    "metres and y up, as glTF demands, so that programs show the true size; with colours",
     _SIZES,
     writing(encode_glb),
     takes_points=True,
     takes_meshes=True,
     unit="m",
+    holds_origin=False,
 )

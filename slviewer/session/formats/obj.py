@@ -1,5 +1,5 @@
 """OBJ: text, mm, with colours of the vertices and normals; and with a texture in an image beside
-it."""
+it. OFF is read too."""
 
 import io
 from collections.abc import Sequence
@@ -10,7 +10,9 @@ import numpy as np
 
 from slviewer import __version__
 from slviewer.session.atomic import arriving_file, replace_file
+from slviewer.session.columns import Columns
 from slviewer.session.ply import to_ascii
+from slviewer.session.polygons import read_polygons
 from slviewer.session.shape_format import (
     DECIMALS,
     Shape,
@@ -54,10 +56,17 @@ def write_textured_obj(
     return sum(each.stat().st_size for each in (path, mtl, png))
 
 
+def _read(path: Path, data: bytes, notes: list[str]) -> list[Columns]:
+    """Return the numbers of the vertices, of a file without faces."""
+    return [read_polygons(path.name, data, notes).columns]
+
+
 FORMAT = ShapeFormat(
     "obj",
     "mm; with colours and normals",
     Sizes(200, 66, 21, face=9, digit=6),
     writing(_encode),
     takes_meshes=True,
+    read=_read,
+    others=("off",),
 )

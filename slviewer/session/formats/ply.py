@@ -1,15 +1,13 @@
 """PLY: binary, float32, mm, with normals, colours, the expected errors (sigma) and other values of
 each point."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
+from slviewer.session.columns import Columns
 from slviewer.session.ply import FACE, write_ply
-from slviewer.session.shape_format import Columns, Shape, ShapeFormat, Sizes, split_shape
+from slviewer.session.polygons import read_polygons
+from slviewer.session.shape_format import Shape, ShapeFormat, Sizes, split_shape
 
 
 def _write(path: Path, shape: Shape, scalars: Columns, notes: Sequence[str]) -> None:
@@ -17,15 +15,9 @@ def _write(path: Path, shape: Shape, scalars: Columns, notes: Sequence[str]) -> 
     write_ply(path, points, shape.colours, shape.normals, scalars, faces, notes)
 
 
-def _read(path: Path, data: bytes) -> list[Columns]:
+def _read(path: Path, data: bytes, notes: list[str]) -> list[Columns]:
     """Return the properties of the vertices by name."""
-    import trimesh
-
-    loaded: Any = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
-    vertices = loaded.metadata["_ply_raw"]["vertex"]
-    values = vertices["data"]
-    names = values if isinstance(values, dict) else values.dtype.names
-    return [{name: np.ravel(values[name])[: vertices["length"]] for name in names}]
+    return [read_polygons(path.name, data, notes).columns]
 
 
 FORMAT = ShapeFormat(
@@ -36,4 +28,5 @@ FORMAT = ShapeFormat(
     takes_points=True,
     takes_meshes=True,
     read=_read,
+    holds_scalars=True,
 )

@@ -15,5 +15,10 @@ def _encode(shape: Shape, notes: Sequence[str]) -> bytes:
 
 
 FORMAT = ShapeFormat(
-    "stl", "mm; the triangles alone", Sizes(84, 0, face=50), writing(_encode), takes_meshes=True
+    "stl",
+    "mm; the triangles alone",
+    Sizes(84, 0, face=50),
+    writing(_encode),
+    takes_meshes=True,
+    holds_origin=False,
 )

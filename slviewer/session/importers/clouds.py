@@ -4,30 +4,38 @@
 
 import re
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from slviewer.errors import InputError
+from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.vectors import diagonal, finite_rows, lengths
+from slviewer.session.columns import SENSOR, Columns, select_columns
 from slviewer.session.nominal import FORMATS as MESHES
-from slviewer.session.nominal import MAX_COORDINATE_MM, MM, Units, read_nominal
+from slviewer.session.nominal import MAX_COORDINATE_MM, read_nominal
 from slviewer.session.ply import COLOURS, NORMAL, PLACE
 from slviewer.session.reading import MAX_CLOUD_BYTES, expand_user, read_input
 from slviewer.session.results import digest_bytes
 from slviewer.session.shape_files import own_formats
+from slviewer.session.units import MM, Units, read_units
 from slviewer.surface.shapes import Mesh, vertex_normals
 
 _READ = {each: form for form in own_formats().values() if form.read for each in form.suffixes}
 FORMATS = (*_READ, *(each for each in MESHES if each not in _READ))
 LEAST_POINTS = 100
-SMALLEST_MM, LARGEST_MM = 2.0, 10_000.0
-"""Diagonals outside of which the unit may be another."""
+SMALLEST_MM, LARGEST_MM = 2.0, 2_000.0
+"""Diagonals outside of which the unit may be another: a thousand times apart, as mm and m are."""
 LONGEST_EDGE = 0.02
 """Of a mesh's diagonal: longer edges are divided, or a flat face would have its corners alone."""
-_SIGMAS = ("sigma", "sigma_noise")
+_FACES = {
+    ".ply": re.compile(rb"\A[^\0]{0,65536}?element face [ ]*[1-9]"),
+    ".obj": re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE),
+    ".off": re.compile(rb"\A\s*\w*OFF(?:\s*#[^\n]*\n)*\s*\d+[ \t]+[1-9]"),
+}
+"""What shows that a file is of a mesh, in formats that may hold points alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +43,7 @@ class ReadCloud:
     """Points of a file: ``points`` (n, 3) float64 mm, finite; where the file has them unit
     ``normals`` (n, 3), NaN where unknown, ``colours`` (n, 3) uint8, ``sigma_mm`` (n,), and the
     place of the ``sensor`` (3,) mm. ``unit``: that of its numbers; ``notes``: on what was dropped
-    or added."""
+    or added. ``scalars``: all other values (n,) by name, as the file has them."""
 
     points: np.ndarray
     unit: Units
@@ -44,6 +52,7 @@ class ReadCloud:
     sigma_mm: np.ndarray | None = None
     sensor: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    scalars: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def read_cloud(path: Path | str, unit: Units | None = None) -> tuple[str, list[ReadCloud]]:
@@ -59,26 +68,26 @@ def read_cloud(path: Path | str, unit: Units | None = None) -> tuple[str, list[R
             f"{path.name} is not a cloud that can be read", f"give {', '.join(FORMATS)}"
         )
     data = read_input(path, MAX_CLOUD_BYTES, "check its name, and that it is below 2 GiB")
-    is_mesh = suffix in MESHES
-    if suffix == ".ply":
-        is_mesh = re.search(rb"element face [1-9]", data[:65536]) is not None
-    if is_mesh:
+    faces = _FACES.get(suffix)
+    if suffix in MESHES and (faces is None or faces.search(data)):
         return digest_bytes(data).hex(), [_read_mesh(path, unit)]
+    notes: list[str] = []
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             chosen = _READ[suffix]
             assert chosen.read is not None
-            columns = chosen.read(path, data)
-    except InputError:
+            columns = chosen.read(path, data, notes)
+    except SlviewerError:
         raise
     except Exception as error:  # a file from anywhere may make its reader fail in any way
         raise InputError(
             f"{path.name} cannot be read ({type(error).__name__}: {error})",
-            "it is damaged or truncated; export the cloud again",
+            "it is damaged, truncated or of a kind that is not read; export the cloud again",
         ) from error
-    units = unit or chosen.unit
-    return digest_bytes(data).hex(), [_check_points(path.name, each, units) for each in columns]
+    units = read_units(path.name, data, unit, notes) or chosen.unit
+    clouds = [_check_points(path.name, each, units, notes) for each in columns]
+    return digest_bytes(data).hex(), clouds
 
 
 def unit_warning(name: str, points: np.ndarray, unit: Units) -> str:
@@ -95,52 +104,55 @@ def unit_warning(name: str, points: np.ndarray, unit: Units) -> str:
     )
 
 
-def _check_points(name: str, columns: Mapping[str, np.ndarray], unit: Units) -> ReadCloud:
+def _check_points(name: str, columns: Columns, unit: Units, about_file: Sequence[str]) -> ReadCloud:
     """Return the columns of a file, whose ``sensor`` is a place, as points without NaN."""
-    points = _stack(columns, PLACE)
-    if points is None or not len(points):
+    notes = [*about_file]
+    values, scalars = select_columns(name, columns, notes)
+    points = values[PLACE]
+    if not len(points):
         raise InputError(f"{name} holds no points", "export the cloud again")
     known = finite_rows(points)
     if not (count := int(known.sum())):
         raise InputError(f"all {len(points):,} points of {name} are NaN", "export the cloud again")
-    dropped = len(known) - count
-    notes = [f"{dropped:,} of {len(known):,} points were NaN, and dropped"] if dropped else []
+    if dropped := len(known) - count:
+        notes.append(f"{dropped:,} of {len(known):,} points were NaN, and dropped")
     once = np.unique(points[known], axis=0, return_index=True)[1]
     if repeated := count - len(once):
         notes.append(f"{repeated:,} of {count:,} points were repetitions, and dropped")
         known = np.flatnonzero(known)[np.sort(once)]
-    points = MM[unit] * points[known].astype(np.float64)
+    values = {kind: each[known] for kind, each in values.items()}
+    scalars = {each: numbers[known] for each, numbers in scalars.items()}
+    points = MM[unit] * values[PLACE].astype(np.float64)
     check_extent(name, points)
-    normals, colours = (_stack(columns, each) for each in (NORMAL, COLOURS))
+    normals, sigma = values.get(NORMAL), values.get(("sigma",))
     if normals is not None:
-        long = lengths(normals := normals[known].astype(np.float64))
+        long = lengths(normals := normals.astype(np.float64))
         normals = np.where(long > 0, normals.T / np.maximum(long, 1e-12), np.nan).T
-    colours = None if colours is None or colours.dtype != np.uint8 else colours[known]
-    sigma = next((MM[unit] * columns[each][known] for each in _SIGMAS if each in columns), None)
-    sensor = MM[unit] * columns["sensor"] if "sensor" in columns else None
-    return ReadCloud(points, unit, normals, colours, sigma, sensor, tuple(notes))
+    return ReadCloud(
+        points,
+        unit,
+        normals,
+        values.get(COLOURS),
+        None if sigma is None else MM[unit] * sigma[:, 0],
+        MM[unit] * columns[SENSOR] if SENSOR in columns else None,
+        tuple(notes),
+        scalars,
+    )
 
 
 def check_extent(name: str, points: np.ndarray) -> None:
-    """Raise InputError for points (n, 3) mm that are too few, in one place, or too far away."""
+    """Raise InputError for points (n, 3) mm that are too few, in one place, or too far apart."""
     if len(points) < LEAST_POINTS or not diagonal(points) > 0:
         raise InputError(
             f"{name} holds {len(points)} points, {diagonal(points):.3g} mm across",
             f"at least {LEAST_POINTS} in different places are needed",
         )
-    if not (far := np.abs(points).max()) < MAX_COORDINATE_MM:
+    if not (size := np.ptp(points, axis=0).max()) < MAX_COORDINATE_MM:
         raise InputError(
-            f"{name} reaches {far:.3g} mm",
-            f"points up to {MAX_COORDINATE_MM:g} mm are read; give its --unit, or move it to its"
-            " origin",
+            f"{name} measures {size:.3g} mm across",
+            f"clouds up to {MAX_COORDINATE_MM:g} mm are read; give its --unit, or delete points"
+            " that do not belong to it",
         )
-
-
-def _stack(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:
-    """Return columns (n, k) by their names; None where one is missing."""
-    if not set(names) <= columns.keys():
-        return None
-    return np.stack([np.ravel(columns[name]) for name in names], axis=1)
 
 
 def _read_mesh(path: Path, unit: Units | None) -> ReadCloud:
@@ -150,6 +162,11 @@ def _read_mesh(path: Path, unit: Units | None) -> ReadCloud:
 
     nominal = read_nominal(path, unit)
     mesh, notes = nominal.mesh, list(nominal.notes)
+    values, scalars = dict[tuple[str, ...], np.ndarray](), dict[str, np.ndarray]()
+    if nominal.columns:
+        values, scalars = select_columns(path.name, nominal.columns, notes)
+    if NORMAL in values:
+        notes.append("not used: the normals of its vertices, but those of its faces")
     longest = LONGEST_EDGE * diagonal(mesh.vertices)
     corners = mesh.vertices[mesh.faces]
     if lengths(corners - np.roll(corners, 1, axis=1)).max() > longest:
@@ -163,5 +180,9 @@ def _read_mesh(path: Path, unit: Units | None) -> ReadCloud:
         mesh = divided
     check_extent(path.name, mesh.vertices)
     normals = vertex_normals(mesh).astype(np.float64)
-    points = mesh.vertices.astype(np.float64)
-    return ReadCloud(points, nominal.units or "mm", normals, notes=tuple(notes))
+    points, colours, unit = nominal.origin_mm + mesh.vertices, None, nominal.units or "mm"
+    if COLOURS in values or scalars:  # of the nearest vertex, which may be one of several there
+        nearest = KDTree(MM[unit] * values[PLACE].astype(np.float64)).query(points)[1]
+        colours = values[COLOURS][nearest] if COLOURS in values else None
+        scalars = {each: numbers[nearest] for each, numbers in scalars.items()}
+    return ReadCloud(points, unit, normals, colours, notes=tuple(notes), scalars=scalars)

@@ -1,15 +1,18 @@
-"""OpenCV FileStorage files (YAML, XML, JSON) and other YAML, parsed in a process of its own.
+"""Calibration files of other programs (YAML, XML, JSON of OpenCV and others, INI, MAT), parsed in a
+process of its own.
 
-Some malformed ones crash OpenCV's parser, and others make it use all memory or never end.
+Some malformed ones make a parser use all memory or never end.
 """
 
 import json
+import re
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 import yaml
 
@@ -18,6 +21,7 @@ from slviewer.session.reading import limit_process, read_input, run_isolated
 
 _MAX_BYTES = 1 << 24
 _MAX_NUMBERS = 10_000
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?\.?(?i:nan|inf)")
 
 
 @dataclass(frozen=True)
@@ -43,15 +47,23 @@ class Storage:
             )
         return matrix
 
+    def list_unused(self, used: Iterable[str]) -> list[str]:
+        """The keys of entries that are not among those ``used``, but texts and mappings."""
+        starts = {key.rpartition(".")[0] for key in self.entries}
+        left_out = {*used} | starts | self.words.keys()
+        return [key for key in self.entries if key not in left_out]
+
 
 def read_storage(path: Path) -> Storage:
-    """The matrices of an OpenCV FileStorage file; InputError where it cannot be read."""
-    read_input(path, _MAX_BYTES, "give an OpenCV FileStorage file (.yml, .xml or .json)")
+    """The matrices of a calibration file; InputError where it cannot be read."""
+    kinds = "YAML, XML, JSON, INI or MAT"
+    check_mat(path.name, read_input(path, _MAX_BYTES, f"give a calibration as {kinds}"))
     status, output = run_isolated(__name__, str(path.absolute()))
     if status != 0:
-        reason = "is no" if status == 1 else "makes OpenCV's parser fail, as it is too large or no"
+        reason = "damaged, or none" if status == 1 else "too large, or none"
         raise InputError(
-            f"{path.name} {reason} OpenCV FileStorage file (.yml, .xml or .json)",
+            f"{path.name} is {reason} of the calibration files that are read ({kinds}, as OpenCV,"
+            " ROS, Kalibr and MATLAB write them)",
             "export the calibration again",
         )
     entries, words = json.loads(output)
@@ -62,21 +74,30 @@ def read_storage(path: Path) -> Storage:
     )
 
 
+def check_mat(name: str, data: bytes) -> None:
+    """Raise InputError for a file of MATLAB's version 7.3, which is HDF5."""
+    if data.startswith(b"MATLAB 7.3"):
+        raise InputError(f"{name} is of MATLAB's version 7.3", "save it with the option -v7")
+
+
 def _parse(path: str) -> tuple[dict[str, Any], dict[str, str]]:
     """Return {key: nested lists of numbers, or None} for the entries of a file, and {key: text}.
-    Raises what OpenCV and the YAML parser raise.
+    Raises what the parsers raise.
 
     Entries of a mapping have its key and a dot before their own.
     """
-    try:
-        storage = cv2.FileStorage(path, cv2.FILE_STORAGE_READ)
-        is_storage = storage.isOpened()
-    except (cv2.error, SystemError):
-        is_storage = False
-    if is_storage:
-        tree = _plain(storage.root())
-    else:  # YAML of other programs lacks OpenCV's first line
-        tree = yaml.safe_load(Path(path).read_text(encoding="utf-8-sig"))
+    is_mat = Path(path).suffix.lower() == ".mat"
+    text = "" if is_mat else Path(path).read_text(encoding="utf-8-sig")
+    if is_mat:
+        tree = {key: v for key, v in _load_mat(path).items() if not key.startswith("__")}
+    elif text.lstrip().startswith("<"):
+        tree = _read_xml(ElementTree.fromstring(text))  # noqa: S314 - within limits
+    elif re.match(r"\s*([#;].*\s+)*\[[^\]\n,]+\]\s*\n", text):
+        tree = _read_ini(text)
+    else:
+        # OpenCV writes NaN as YAML does, in JSON too, whose rest is YAML
+        text = re.sub(r"\A%YAML.*", "", text).replace(".Nan", ".nan").replace("\t", " ")
+        (tree,) = filter(None, yaml.load_all(text, _Loader))
     if not isinstance(tree, dict):
         raise ValueError("no storage")
     numbers: dict[str, Any] = {}
@@ -85,29 +106,67 @@ def _parse(path: str) -> tuple[dict[str, Any], dict[str, str]]:
     return numbers, words
 
 
-def _plain(node: Any) -> Any:
-    """Return a FileStorage node as a number, text, list or mapping; a matrix as nested lists, and
-    None for what holds too much."""
-    if node.isInt() or node.isReal():
-        return node.real()
-    if node.isString():
-        return node.string()
-    if node.isMap():
-        try:
-            return _limited(node.mat())
-        except (cv2.error, ValueError):
-            return {key: _plain(node.getNode(key)) for key in node.keys()}  # noqa: SIM118
-    if not node.isSeq() or node.size() > _MAX_NUMBERS:
-        return None
-    return [_plain(node.at(i)) for i in range(node.size())]
+def _load_mat(path: str) -> dict[str, Any]:
+    """Return the variables of a MAT file; structs as mappings."""
+    from scipy.io import loadmat
+
+    found: dict[str, Any] = loadmat(path, simplify_cells=True)
+    return found
 
 
-def _limited(matrix: np.ndarray | None) -> list[Any] | None:
-    """Return a matrix as nested lists; None for one that is too large. Raises ValueError for
-    none."""
-    if matrix is None:
-        raise ValueError("no matrix")
-    return None if matrix.size > _MAX_NUMBERS else np.asarray(matrix, np.float64).tolist()
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Reads YAML with the matrices of OpenCV."""
+
+
+_Loader.add_multi_constructor(
+    "tag:yaml.org,2002:opencv-",
+    lambda loader, _, node: loader.construct_mapping(node, deep=True),
+)
+
+
+def _read_xml(node: ElementTree.Element) -> Any:
+    """Return an element as a mapping, list, text, number or list of numbers."""
+    if len(node):
+        if all(child.tag == "_" for child in node):
+            return [_read_xml(child) for child in node]
+        return {child.tag: _read_xml(child) for child in node}
+    return _read_words((node.text or "").split())
+
+
+def _read_words(words: list[str]) -> Any:
+    """Return words as a number, a list of numbers, or a text."""
+    if not words or not all(map(_NUMBER.fullmatch, words)):
+        return " ".join(words).strip('"')
+    values = [_to_float(word) for word in words]
+    return values if len(values) > 1 else values[0]
+
+
+def _to_float(word: str) -> float:
+    """Return the number in a word."""
+    return float(word.lower().replace(".nan", "nan").replace(".inf", "inf"))
+
+
+def _read_ini(text: str) -> dict[str, Any]:
+    """Return the sections of an INI, with names = values, or names above lines of numbers."""
+    tree: dict[str, Any] = {}
+    section, key = tree, ""
+    for line in _list_lines(text):
+        name, is_value, value = line.partition("=")
+        words = line.split()
+        if line.startswith("["):
+            section = tree.setdefault(line.strip("[] "), {})
+        elif is_value:
+            section[name.strip()] = _read_words(value.replace(",", " ").split())
+        elif all(map(_NUMBER.fullmatch, words)):
+            section[key].append([_to_float(word) for word in words])
+        else:
+            section[key := line] = []
+    return tree
+
+
+def _list_lines(text: str) -> Iterable[str]:
+    """Return the lines of an INI that are neither empty nor comments."""
+    return (line for line in map(str.strip, text.splitlines()) if line and line[0] not in "#;")
 
 
 def _flatten(
@@ -117,19 +176,39 @@ def _flatten(
     for name, value in tree.items():
         key = f"{start}{name}"
         if isinstance(value, str):
-            words[key], value = value, None
-        if isinstance(value, dict) and not {"rows", "cols", "data"} <= value.keys():
+            words[key] = value
+            value = _to_float(value) if _NUMBER.fullmatch(value) else None
+        if isinstance(value, dict) and not _is_matrix(value):
             numbers[key] = None
             _flatten(f"{key}.", value, numbers, words)
             continue
         try:
-            if isinstance(value, dict):
-                value = np.reshape(value["data"], (value["rows"], value["cols"])).tolist()
-            matrix = np.atleast_1d(np.array(value, np.float64))
+            matrix = np.atleast_1d(_to_matrix(value))
             is_matrix = value is not None and matrix.size <= _MAX_NUMBERS and matrix.ndim <= 3
             numbers[key] = matrix.tolist() if is_matrix else None
         except (ValueError, TypeError):
             numbers[key] = None
+
+
+def _is_matrix(value: dict[Any, Any]) -> bool:
+    """Whether a mapping is a matrix of OpenCV or ROS."""
+    return "data" in value and ({"rows", "cols"} <= value.keys() or "sizes" in value)
+
+
+def _to_matrix(value: Any) -> np.ndarray:
+    """Return numbers as an array; of rows and cols with data too, whose numbers count where they
+    are a row or column of another length than stated, as ROS writes eight under "cols: 5". Raises
+    ValueError or TypeError for others."""
+    if not isinstance(value, dict):
+        return np.array(value, np.float64)
+    data = np.array(value["data"], np.float64)
+    if "sizes" in value:
+        return data.reshape(np.atleast_1d(value["sizes"]).astype(int))
+    rows, cols = int(value["rows"]), int(value["cols"])
+    if min(rows, cols) == 1 and data.size % (rows * cols):
+        return data.reshape(1, -1)
+    data = data.reshape(rows, cols, -1)
+    return data[..., 0] if data.shape[2] == 1 else data
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ gray_cell_px = 18.0      # width of the cells that the Gray bits number; by defa
                          # period, or 1 px without
 relative = false         # true: steps alone whose periods do not cover the projector; the
                          # phase is not absolute
+code = "gray"            # "binary": the bits are plain binary numbers (beside phase steps they are
+                         # stored as Gray code)
 full_scale = 4095        # grey level at which a camera of more than 8 bits clips; by default as
                          # the files state it
 channel = "green"        # of colour images: red, green (the default), blue, luma or max
@@ -17,7 +19,8 @@ channel = "green"        # of colour images: red, green (the default), blue, lum
 [[frame]]                # one image
 file = "00.png"          # relative to the capture's folder; * and ? are wildcards, brackets are
                          # plain characters
-kind = "phase"           # phase, gray, inverse, complementary, white, black, texture
+kind = "phase"           # phase, gray, inverse, complementary, white, black, texture; binary: a
+                         # bit of code = "binary"
 axis = "x"               # x varies along projector columns, y along rows; none for white,
                          # black, texture
 step = 0                 # phase: step of steps, at a period in projector px
@@ -43,7 +46,8 @@ projector = "1280x800"
 kind = "phase"
 axis = "x"
 steps = 4                # 4 images, in order of the steps
-period_px = 20.0         # or a list: all steps of the first period, then of the second ...
+period_px = 20.0         # or a list: all steps of the first period, then of the second ...;
+                         # "912/70": 70 fringes across 912 px, which decimals would round
 files = "fringe_*.png"
 
 [[frames]]
@@ -70,6 +74,7 @@ all that the one saw, and the same frames of the other. Pixels of clouds are tho
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -77,6 +82,7 @@ import msgspec
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import (
+    KINDS,
     SEQUENCE_KEYS,
     Axis,
     Frame,
@@ -124,16 +130,29 @@ class _Phase(_Group):
     """Phase-shifted fringes of one or several periods, ``steps`` images each."""
 
     steps: Annotated[int, msgspec.Meta(ge=3, le=1000)]
-    period_px: _Period | list[_Period]
+    period_px: _Period | str | list[_Period | str]
 
     def frames(self) -> list[Frame]:
         """Return the phase steps of all periods, period by period."""
         periods = self.period_px if isinstance(self.period_px, list) else [self.period_px]
         return [
-            Frame("phase", self.axis, step=k, steps=self.steps, period_px=float(period))
+            Frame("phase", self.axis, step=k, steps=self.steps, period_px=_to_px(period))
             for period in periods
             for k in range(self.steps)
         ]
+
+
+def _to_px(period: float | str) -> float:
+    """Return a period as a number; "912/70" states 70 fringes across 912 px."""
+    try:
+        if isinstance(period, str) and "/" not in period:
+            raise ValueError
+        return float(Fraction(period))
+    except (ValueError, ZeroDivisionError, OverflowError):
+        raise InputError(
+            f"period_px {period!r} (str) is neither a number nor a ratio",
+            'write px, such as 18.0, or a projector\'s size by its fringes, such as "912/70"',
+        ) from None
 
 
 class _Inverse(_Group):
@@ -247,9 +266,10 @@ def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
             raise InputError(f"{where}: {key} must be a word in quotes, not {entry[key]!r}")
     try:
         exposure: float | None = msgspec.convert(entry.get("exposure_ms"), _Exposure)
-        frame = Frame.from_dict(
-            {key: value for key, value in entry.items() if key != "exposure_ms"}
-        )
+        fields = {key: value for key, value in entry.items() if key != "exposure_ms"}
+        if isinstance(period := fields.get("period_px"), str):
+            fields["period_px"] = _to_px(period)
+        frame = Frame.from_dict(fields)
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: exposure_ms: {error}") from error
     except InputError as error:
@@ -261,6 +281,8 @@ def _read_group(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
     """Read a `[[frames]]` table: all images of one kind and axis."""
     words = " ".join(str(entry[key]) for key in ("kind", "axis") if key in entry)
     where = f"{where} ({words})" if words else where
+    if isinstance(kind := entry.get("kind"), str) and kind not in get_args(Kind):
+        raise InputError(f"{where}: frame kind {kind!r} is unknown", f"use one of {KINDS}")
     try:
         group = msgspec.convert(entry, _GROUPS.get(str(entry.get("kind")), _Group))
         frames = tuple(group.frames())
@@ -479,6 +501,7 @@ def _split_cameras(
 
 def _describe(name: str, data: Mapping[str, Any], projector: Size | None) -> Description:
     """What the entries of one camera in the TOML ``name`` describe."""
+    data = _read_code(name, data)
     groups = read_groups(name, data)
     try:
         exposures, order = _list_exposures(groups)
@@ -491,6 +514,25 @@ def _describe(name: str, data: Mapping[str, Any], projector: Size | None) -> Des
     return Description(
         sequence, groups, tuple(order), exposures, data.get("channel"), "gray_origin" in data
     )
+
+
+def _read_code(name: str, data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the content of a TOML with the kind "binary" as Gray bits of code = "binary". Raises
+    InputError for both codes."""
+    key = "frames" if "frames" in data else "frame"
+    entries = data.get(key)
+    if not isinstance(entries, list):
+        return data
+    kinds = [each.get("kind") if isinstance(each, Mapping) else None for each in entries]
+    if "binary" not in kinds:
+        return data
+    if "gray" in kinds or data.get("code", "binary") != "binary":
+        raise InputError(f"{name} describes both Gray code and binary code", "use one of them")
+    shown = [
+        {**each, "kind": "gray"} if kind == "binary" else each
+        for each, kind in zip(entries, kinds, strict=True)
+    ]
+    return {**data, "code": "binary", key: shown}
 
 
 def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], list[int]]:

@@ -331,14 +331,15 @@ def _apply_conventions(
         return _check_fringes(sequence, axis, parts.runs, reader, findings)
     images = _list_images(sequence, axis)
     if not parts.runs:
+        codes = [replace(sequence, binary=binary) for binary in (False, True)]
+        sequence = max(codes, key=lambda code: _share_explained(code, axis, evaluator))
+        name = "plain binary code" if sequence.binary else "Gray code"
         findings.notes.append(
-            f"axis {axis}: Gray code alone, taken to number the projector's {LINES[axis]} one"
-            " by one"
+            f"axis {axis}: {name} alone, taken to number the projector's {LINES[axis]} one by one"
         )
     else:
         sequence = _fit_code(sequence, axis, parts, evaluator, findings)
-    m = evaluator.match(described(sequence), axis)
-    explained = 0.0 if m is None else float(np.mean(m.misfit < limits.GOOD))
+    explained = _share_explained(sequence, axis, evaluator)
     if explained < MOST_EXPLAINED:
         text = f"axis {axis}: {100 * explained:.0f} % of the pixels fit this code"
         findings.doubts.append((images, f"{text}, of {100 * MOST_EXPLAINED:.0f} % at least"))
@@ -346,6 +347,12 @@ def _apply_conventions(
         text = _describe_reversal(axis, "the code falls", "or a most significant bit is missing")
         findings.doubts.append((images, text))
     return sequence
+
+
+def _share_explained(sequence: PatternSequence, axis: Axis, evaluator: Evaluator) -> float:
+    """Return the share of the pixels that the patterns of an axis explain."""
+    m = evaluator.match(described(sequence), axis)
+    return 0.0 if m is None else float(np.mean(m.misfit < limits.GOOD))
 
 
 def _list_images(sequence: PatternSequence, axis: Axis) -> Indices:

@@ -55,11 +55,14 @@ def guess_description(
         f"{_format_span(names, indices)}: {text}{hint}" for indices, text in guess.doubts
     )
     toml = _format_toml(folder, names, guess, shown, size, doubts)
-    summary = (*_summarise_frames(names, guess.frames), *guess.notes)
+    is_binary = guess.sequence is not None and guess.sequence.binary
+    summary = (*_summarise_frames(names, guess.frames, is_binary), *guess.notes)
     return GuessedDescription(toml, summary, doubts, guess.sequence is not None)
 
 
-def _summarise_frames(names: list[str], frames: Sequence[Frame | None]) -> list[str]:
+def _summarise_frames(
+    names: list[str], frames: Sequence[Frame | None], is_binary: bool
+) -> list[str]:
     """Return a line for each group of neighbouring images of one kind and axis."""
 
     def describe(index: int) -> str:
@@ -71,7 +74,7 @@ def _summarise_frames(names: list[str], frames: Sequence[Frame | None]) -> list[
         if frame.kind == "phase":
             return f"{frame.steps} phase steps{along}, period {frame.period_px:g} px"
         if frame.kind in ("gray", "inverse"):
-            return f"Gray code of {frame.bits} bits{along}"
+            return f"{'binary' if is_binary else 'Gray'} code of {frame.bits} bits{along}"
         return f"{frame.kind}{along}"
 
     groups = groupby(range(len(names)), key=describe)
@@ -109,7 +112,7 @@ def _format_toml(
     if channel is not None:
         lines.append(f"channel = {format_value(channel)}")
     # Without gray_origin the import estimates it from the images.
-    keys = ("phase_sign", "phase_offset", "gray_cell_px", "relative")
+    keys = ("phase_sign", "phase_offset", "gray_cell_px", "relative", "code")
     lines += table_lines({key: described[key] for key in keys if key in described})
     evidence: dict[int, list[str]] = {}
     for image, text in guess.evidence:

@@ -4,8 +4,9 @@ without a word."""
 import io
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,6 +18,7 @@ from PIL import Image
 from slviewer.errors import InputError
 from slviewer.fringe.layout import clip_level
 from slviewer.fringe.raw_image import RAW_SUFFIXES, develop
+from slviewer.session.names import join_names
 from slviewer.session.reading import MAX_IMAGE_BYTES, read_file, read_input
 
 IMAGE_SUFFIXES = RAW_SUFFIXES | {
@@ -42,6 +44,17 @@ warnings.filterwarnings("ignore", module=r"PIL\.")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHECKED = (_PNG, b"\xff\xd8", b"BM")
 """Beginnings of PNG, JPEG and BMP files, which OpenCV may decode as far as they go."""
+ORIENTATION_TAG = 274
+_TURNS_BACK: Mapping[int, Callable[[np.ndarray], np.ndarray]] = {
+    2: np.fliplr,
+    3: lambda pixels: np.rot90(pixels, 2),
+    4: np.flipud,
+    5: lambda pixels: pixels.swapaxes(0, 1),
+    6: lambda pixels: np.rot90(pixels, 1),
+    7: lambda pixels: np.rot90(pixels.swapaxes(0, 1), 2),
+    8: lambda pixels: np.rot90(pixels, -1),
+}
+"""What undoes the orientations of EXIF, which OpenCV applies to TIFF files, and to no others."""
 _NETPBM = re.compile(
     rb"P[1-7]" + 2 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"(?:(?:\s|#[^\n]*\n)+(\d{1,5})\s)?"
 )
@@ -73,7 +86,7 @@ def read_frames(
     Colour frames are reduced to one channel, by default green: a colour camera samples it most
     densely, and unlike a mixture it stays linear up to the level at which it saturates, which
     decoding can see. Raises InputError, naming the file, for an image that is missing, cut short,
-    damaged, of another size or bit depth than the first, or transparent.
+    damaged, of another size or bit depth than the first.
     """
     first = read_image(paths[0])
     try:
@@ -156,17 +169,19 @@ def reduce_channels(
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(h, w) or (h, w, 3) BGR, uint8 or uint16. Raises InputError for anything that is not wholly
-    an image."""
+    """(h, w) or (h, w, 3) BGR, uint8 or uint16, without an alpha channel, in the rows and columns
+    of the sensor, however the camera was turned (EXIF). Raises InputError for anything that is not
+    wholly an image."""
     data, name = read_input(path, MAX_IMAGE_BYTES, "check the file"), _short_path(path)
     if not data:
         raise InputError(f"{name} is empty", "copy or record it again")
     if is_raw(path):
         return cv2.cvtColor(develop(data, name, MAX_PIXELS).rgb, cv2.COLOR_RGB2BGR)
-    width = height = 0
+    width = height = orientation = 0
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
             width, height = image.size
+            orientation = _read_orientation(image)
             if width * height <= MAX_PIXELS and data.startswith(_CHECKED):
                 (image.verify if data.startswith(_PNG) else image.load)()
     except Exception as error:  # a malformed file may make Pillow fail in any way
@@ -190,11 +205,32 @@ def read_image(path: Path) -> np.ndarray:
         raise InputError(
             f"{name} has pixels of type {pixels.dtype}", "save frames with 8 or 16 bits"
         )
-    if pixels.ndim == 3 and pixels.shape[2] != 3:
-        raise InputError(
-            f"{name} has {pixels.shape[2]} channels", "save frames in grey or RGB, without alpha"
-        )
-    return pixels
+    if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
+        raise InputError(f"{name} has {pixels.shape[2]} channels", "save frames in grey or RGB")
+    pixels = _TURNS_BACK.get(orientation, np.asarray)(pixels)
+    return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., :3])
+
+
+def _read_orientation(image: Image.Image) -> int:
+    """Return the orientation in which OpenCV reads an image, as in EXIF; 0 where it does not turn
+    it."""
+    return image.getexif().get(ORIENTATION_TAG, 0) if image.format == "TIFF" else 0
+
+
+def warn_of_alpha(paths: Sequence[Path]) -> list[str]:
+    """A warning that images have a channel that `read_image` leaves aside, by their headers, as a
+    list of one, or of none."""
+    named = []
+    for path in paths:
+        with (
+            suppress(OSError, SyntaxError, ValueError),
+            Image.open(path, formats=_FORMATS) as image,
+        ):
+            if image.mode in ("LA", "PA", "RGBA"):
+                named.append(path.name)
+    if not named:
+        return []
+    return [f"{join_names(named)}: transparency (an alpha channel) is ignored"]
 
 
 def is_raw(path: Path) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.errors import InputError
+from slviewer.fringe.binary_bits import has_binary_beside_phase, to_gray_code
 from slviewer.fringe.sequence import PatternSequence, Size
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers.images import (
@@ -18,6 +19,7 @@ from slviewer.session.importers.images import (
     Channel,
     is_raw,
     read_frames,
+    warn_of_alpha,
 )
 from slviewer.session.names import join_names, natural_key, new_name, plain_name
 from slviewer.session.reading import expand_user
@@ -64,13 +66,15 @@ class ImportableRecording:
         colour_frame = None if shown is None else shown + middle
         images = read_frames(self.files, colour_frame, channel, self.sequence.full_scale)
         settings = {**self.settings, "channel": channel} if images.in_colour else self.settings
-        sequence = replace(self.sequence, full_scale=images.full_scale)
+        sequence, stack = replace(self.sequence, full_scale=images.full_scale), images.stack
+        if has_binary_beside_phase(sequence):
+            sequence, stack = to_gray_code(sequence, stack)
         files = [
             file.relative_to(self.source) if file.is_relative_to(self.source) else file
             for file in self.files
         ]
         return NewCapture(
-            self.name, sequence, images.stack, images.texture, str(self.source), settings,
+            self.name, sequence, stack, images.texture, str(self.source), settings,
             self.exposures_ms,
             tuple(file.as_posix() for file in files),
         )  # fmt: skip
@@ -99,13 +103,14 @@ class Imports:
 
     @property
     def warnings(self) -> list[str]:
-        """The layout's messages, and which files and folders were not used."""
+        """The layout's messages, and which files, folders and channels were not used."""
         unknown = (
             message
             for each in self.recordings
             for message in unknown_files_warning(each.source, each.unknown)
         )
-        return [*self.messages, *unknown]
+        firsts = [each.files[0] for each in self.recordings if each.files]
+        return [*self.messages, *unknown, *warn_of_alpha(firsts)]
 
     def __len__(self) -> int:
         return len(self.recordings)

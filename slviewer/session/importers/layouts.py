@@ -7,7 +7,8 @@ Gray bits, most significant first, F25 or F26 the texture. V varies along projec
 x), H along rows (axis y). Capitals and suffixes vary.
 
 procam-calibration: `capture_N/graycode_NN.*`. Gray code of every projector column, then row; each
-bit, most significant first, as the pattern and its inverse; then white, then black.
+bit, most significant first, as the pattern and its inverse; then white, then black. Its option
+`graycode step` makes cells of several pixels.
 
 sltk: `TIME_[AA-BB-CC_NN]_img.jpg`. AA is the axis (00 columns, 01 rows), BB the bit of the Gray
 code of the projector pixel (0 = finest), CC 00 the pattern and 01 its negative, NN the running
@@ -73,6 +74,8 @@ stripes."""
 _PAIRED = 0.25
 """Mean difference of pattern + inverse and white + black, as a share of white - black: noise, and
 half of it for two patterns."""
+_WIDEST_CELL = 16
+"""Cells, px, that are tried for a number of images."""
 _SAMPLE = re.compile(r"pattern_(cam\d+_)?(im)?\d+", re.IGNORECASE)
 
 
@@ -82,15 +85,17 @@ def _read_graycode(
     prefix: str | None = None,
     projector: Size | None = None,
     files: str | None = None,
+    cell: int = 1,
 ) -> Imports:
     """Captures named after their folders. `files` is a pattern of names (* and ? are wildcards) for
-    a folder that holds more than these images, such as those of a second camera.
+    a folder that holds more than these images, such as those of a second camera; `cell` the width
+    of the code's cells, px.
 
     A capture is skipped where the number of its images contradicts the projector's size.
     """
     if projector is None:
         raise missing_projector("the images of OpenCV's Gray code")
-    sequence = gray(projector)
+    sequence = gray(projector, cell)
 
     def select(folder: Path) -> list[Path]:
         """Return the images of a capture's folder that match ``files``, or all of them."""
@@ -178,9 +183,23 @@ def _fit_sequence(sequence: PatternSequence, images: int, optional: int = 0) -> 
         return PatternSequence(sequence.projector, sequence.frames[:-optional])
     width, height = sequence.projector
     without = f", or {needed - optional} without white and black" if optional else ""
+    cells = [
+        str(cell)
+        for cell in range(1, _WIDEST_CELL + 1)
+        if len(gray(sequence.projector, cell).frames) in (images, images + optional)
+    ]
+    wide = f"; in cells of {' or '.join(cells)} px it takes {images}" if cells else ""
+    remedy = "images are missing or too many, or the projector has another size"
+    if cells:
+        remedy = (
+            "if none is missing, give the projector's size, or the width of the cells that were"
+            f" shown, with --cell {' or '.join(cells)} of `slviewer import procam-calibration` or"
+            " `opencv-graycode`"
+        )
     raise InputError(
         f"it holds {images} images, and the Gray code of a {width}x{height} projector takes"
-        f" {needed}{without}: images are missing or too many, or the projector has another size"
+        f" {needed}{without}{wide}",
+        remedy,
     )
 
 
@@ -295,11 +314,13 @@ def _is_p18(folder: Path) -> bool:
     )
 
 
-def _order_procam(images: Images, projector: Size) -> tuple[PatternSequence, Iterable[Path]]:
-    """Return the sequence, and the files in its order. The projector's size determines the numbers
-    of bits and of images."""
+def _order_procam(
+    images: Images, projector: Size, cell: int = 1
+) -> tuple[PatternSequence, Iterable[Path]]:
+    """Return the sequence, and the files in its order. The projector's size and the width of the
+    cells, px, determine the numbers of bits and of images."""
     check_complete(images, "graycode_")
-    return _fit_sequence(gray(projector), len(images)), images.values()
+    return _fit_sequence(gray(projector, cell), len(images)), images.values()
 
 
 def _order_sltk(images: Images, projector: Size | None) -> tuple[PatternSequence, Iterable[Path]]:

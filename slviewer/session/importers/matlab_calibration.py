@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from slviewer.session.importers.filestorage import Storage
-from slviewer.session.nominal import Units
+from slviewer.session.units import Units
 
 _INTRINSICS = ("IntrinsicMatrix", "K")
 _ROTATIONS = (

@@ -31,6 +31,7 @@ _INTRINSICS = (
     ("M1", "D1", "M2", "D2"),  # OpenCV's stereo_calib
     ("K1", "D1", "K2", "D2"),
     ("K1", "dist1", "K2", "dist2"),
+    ("KK_left", "kc_left", "KK_right", "kc_right"),  # Bouguet's toolbox for MATLAB
 )
 _TRANSFORMS = (
     ENTRIES[4:],
@@ -113,6 +114,16 @@ def read_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
                 sizes[device] = (int(values[0]), int(values[1])), " and ".join(keys)
                 break
     return sizes or matlab_calibration.read_image_sizes(storage)
+
+
+def list_unused(
+    storage: Storage, keys: Sequence[str], sizes: dict[str, tuple[tuple[int, int], str]]
+) -> list[str]:
+    """The entries of a file, without texts and mappings, that neither ``keys`` nor ``sizes``
+    name."""
+    used = [*keys, *(key for _, text in sizes.values() for key in text.split(" and "))]
+    of_matlab = ("TangentialDistortion", "RadialDistortion")
+    return [key for key in storage.list_unused(used) if not key.endswith(of_matlab)]
 
 
 def _list_keys(storage: Storage) -> str:

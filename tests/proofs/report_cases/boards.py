@@ -14,9 +14,9 @@ from slviewer.session.capture import NewCapture
 from slviewer.session.store import Session
 from slviewer.simulation.plans import target_poses
 from slviewer.simulation.rig import letter
-from slviewer.target.board import Board
-from slviewer.target.corners import opencv_board
-from slviewer.target.detect import Detection, detect
+from slviewer.target.board import Board, Detection
+from slviewer.target.charuco import opencv_board
+from slviewer.target.detect import detect
 from tests.proofs.report_cases.case import Case, Outcome, Workplace, read_refusal
 
 _PIXELS_PER_SQUARE = 100
