@@ -10,6 +10,7 @@ import numpy as np
 
 from slviewer.errors import BoardError, DetectionError, InputError
 from slviewer.geometry.rigid import Mask
+from slviewer.geometry.vectors import lengths
 from slviewer.target.board import Board, Detection
 from slviewer.target.charuco import detect_charuco, name_marker_board
 from slviewer.target.circles import detect_circles, list_grids
@@ -20,6 +21,8 @@ from slviewer.target.planar import fit_homography, to_image
 
 _FEWEST = 6
 """Features of a plugin's board that fix its pose with some to spare."""
+_SAME_FEATURE_PX = 2.0
+"""Farthest that two detections of a feature lie apart: less than features do."""
 
 
 def detect(board: Board, image: np.ndarray, *, several: bool = False) -> Detection:
@@ -48,13 +51,15 @@ def detect(board: Board, image: np.ndarray, *, several: bool = False) -> Detecti
     each = _detect_inside(board, whole, several)
     if inside is None or len(each.others) < len(inside.others):
         return each
-    if not several and not np.array_equal(inside.ids, each.ids):
+    shared, first, second = np.intersect1d(inside.ids, each.ids, return_indices=True)
+    apart = lengths(inside.pixels[first] - each.pixels[second])
+    if not several and not (len(shared) and np.all(apart < _SAME_FEATURE_PX)):
         raise DetectionError(
             f"{len(each.ids)} of {len(board.points)} features of {board} have two numberings, with"
             " and without the even strips along the image's borders",
             "move the board so that all of it is in view",
         )
-    return inside
+    return max(inside, each, key=lambda d: len(d.ids))
 
 
 def _detect_inside(
