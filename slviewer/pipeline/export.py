@@ -49,6 +49,7 @@ from slviewer.pipeline.reconstruct import (
 )
 from slviewer.pipeline.report import report
 from slviewer.printable import format_csv
+from slviewer.process import call_apart
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import cloud_normals
 from slviewer.records.kinds import all_kinds
@@ -539,7 +540,8 @@ def _write_shape(store: Session, name: str, target: Path, settings: ExportSettin
     notes = [origin, *filter(None, calibration), *restrictions]
     if settings.what in _MESHES:
         source = cloud if is_scan else points_with_normals(merged)
-        built = build_mesh(source, settings.plan or MeshingPlan(), part(progress, 0.4, 0.8))
+        plan, meshing = settings.plan or MeshingPlan(), part(progress, 0.4, 0.8)
+        built = call_apart(build_mesh, source, plan, progress=meshing)
         made = built.text().splitlines()
         progress(0.85, f"writing {target.name}")
         mesh = replace(built.mesh, origin=origin_mm)

@@ -35,6 +35,7 @@ from slviewer.pipeline.reconstruct import (
     read_merge,
     scan_cloud,
 )
+from slviewer.process import call_apart
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge
 from slviewer.session.capture import Capture
@@ -194,15 +195,17 @@ def mesh(settings: MeshSettings) -> MeshResult:
         if texture is not None:
             clouds, poses = _textured_scans(store, settings, shape, merged)
             rig = load_stereo(store).rig
-    meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
+    meshing = part(progress, 0.5, 0.95 if texture is None else 0.6)
+    meshed = call_apart(build_mesh, shape, plan, progress=meshing)
     notes = (f"of {', '.join(sources)}", *restrictions, *meshed.text().splitlines())
     textured = None
     if texture is not None:
         if gains is not None:
             clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
         painting = stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
-        textured = texture_mesh(
-            meshed.mesh, clouds, poses, size=texture, light=-rig.R.T @ rig.t, progress=painting
+        light = -rig.R.T @ rig.t
+        textured = call_apart(
+            texture_mesh, meshed.mesh, clouds, poses, texture, light, progress=painting
         )
     progress(0.95, f"writing {path.name}")
     if textured is None:

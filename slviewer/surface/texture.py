@@ -72,9 +72,9 @@ def texture_mesh(
     mesh: Mesh,
     scans: Mapping[str, Cloud],
     T_mesh_scan: Mapping[str, np.ndarray],
-    *,
     size: int = 2048,
     light: np.ndarray | None = None,
+    *,
     progress: Progress = lambda share: None,
 ) -> TexturedMesh:
     """Unfold a mesh, and project the scans' textures onto it.
