@@ -431,8 +431,9 @@ def certify_page(certificate: Certificate, page: str) -> str:
     return msgspec.json.encode(msgspec.structs.replace(certificate, page=page)).decode()
 
 
-def certificate_section(certificate: Certificate) -> Section:
-    """Return what a certificate names, as a section of the report."""
+def certificate_section(certificate: Certificate, *, is_full: bool = True) -> Section:
+    """Return what a certificate names, as a section of the report; unless ``is_full``, how much it
+    names."""
     contents: dict[str, tuple[list[str], Rows]] = {
         "Calibrations and records": (
             ["result", "hash"],
@@ -448,6 +449,11 @@ def certificate_section(certificate: Certificate) -> Section:
     tables = [
         Table([*map(Column, titles)], rows, caption)
         for caption, (titles, rows) in contents.items()
-        if rows
+        if rows and is_full
     ]
-    return Section("Certificate", text, tables, is_annex=True)
+    captures = format_count(len(certificate.captures), "capture")
+    results = format_count(len(certificate.results), "result")
+    kept = (
+        f"This file holds the hashes of {captures} and {results}, and the versions of the software."
+    )
+    return Section("Certificate", text if is_full else [text, kept], tables, is_annex=True)

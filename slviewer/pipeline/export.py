@@ -455,6 +455,7 @@ class ExportSettings(Callbacks):
             A merge was cut when it was made.
         frame: Of clouds and meshes: camera, or robot, the base of the machine whose poses `import
             poses` stored, by the hand-eye calibration.
+        full: Of a report: also what concerns the rig, not the part.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     The file is written whole or not at all.
@@ -470,6 +471,7 @@ class ExportSettings(Callbacks):
     plan: MeshingPlan | None = None
     roi: str = ""
     frame: Literal["camera", "robot"] = "camera"
+    full: bool = False
     accept_rejected: bool = False
 
 
@@ -573,7 +575,7 @@ def _write_document(store: Session, name: str, target: Path, settings: ExportSet
     what was written."""
     what, progress = settings.what, settings.progress
     if what == "report":
-        report(store, target, progress=progress, warn=settings.warn)
+        report(store, target, full=settings.full, progress=progress, warn=settings.warn)
         return "report"
     progress(0.1, f"writing {target.name}")
     if what == "coefficients":

@@ -60,6 +60,7 @@ from slviewer.records.verification import Verification
 from slviewer.report.maps import PixelCurve, verification_maps
 from slviewer.report.page import Figure, write_page
 from slviewer.report.session import (
+    RESULTS,
     CalibrationFigures,
     CaptureUse,
     RecordsView,
@@ -100,6 +101,8 @@ class ReportSettings(Callbacks):
         operator: Who measured.
         temperature: Temperature of the room, °C.
         logo: Image of a logo (PNG, JPEG or WebP).
+        full: Also what concerns the rig, not the part: verifications, merges, clouds, models,
+            residuals, captures and hashes. A report without measurements has it anyway.
     """
 
     session: SessionLike
@@ -111,6 +114,7 @@ class ReportSettings(Callbacks):
     operator: str | None = None
     temperature: Annotated[float | None, Input(-100, 200, "°C")] = None
     logo: str | None = None
+    full: bool = False
 
     def changed_details(self) -> dict[str, Any]:
         """Return the stated fields of `ReportDetails`."""
@@ -142,6 +146,7 @@ def report(settings: ReportSettings) -> str:
             settings.warn(message)
         progress(0.4, "drawing")
         title, subtitle = session_title(data)
+        is_full = settings.full or not any(view.kind in RESULTS for view in data.records)
         progress(0.7, "reading the frames")
         certificate = make_certificate(store)
         write_page(
@@ -149,7 +154,10 @@ def report(settings: ReportSettings) -> str:
             title,
             subtitle,
             session_headlines(data),
-            [*session_sections(data), certificate_section(certificate)],
+            [
+                *session_sections(data, is_full=is_full),
+                certificate_section(certificate, is_full=is_full),
+            ],
             partial(certify_page, certificate),
             title_page=make_title_page(data),
         )

@@ -53,6 +53,8 @@ RESULTS: tuple[type[Record], ...] = (Inspection, Measurement)
 ANNEX: tuple[type[Record], ...] = (
     Verification, AcceptanceTest, Merge, Reconstruction, Drift, ModelComparison, ModelCalibration
 )  # fmt: skip
+EVIDENCE = AcceptanceTest, Drift
+"""Of the annex, what also a report for a customer holds: tests of the rig with limits."""
 TERMS = {
     "RMS": "root mean square: the typical size of deviations",
     "noise floor": "the RMS that the noise of a capture alone would give",
@@ -246,21 +248,26 @@ def _plane_headline(data: SessionData) -> list[Headline]:
     return [Headline(f"{means[model]:.3f} mm", "RMS deviation of a flat plate", note)]
 
 
-def session_sections(data: SessionData) -> list[Section]:
+def session_sections(data: SessionData, *, is_full: bool = True) -> list[Section]:
     """Sections: warnings, what was inspected and measured; as annex the other records, calibration,
-    restrictions, method, and captures."""
+    restrictions, method, and captures. Those of a customer, unless ``is_full``, hold of the annex
+    what proves and limits the results."""
     views = {view.kind: view for view in data.records}
     results = [_records_section(views.pop(kind), data.labels) for kind in RESULTS if kind in views]
     first = [views.pop(kind) for kind in ANNEX if kind in views]
-    annex = [_records_section(view, data.labels) for view in (*first, *views.values())]
+    others, left_out = [*first, *views.values()], list[RecordsView]()
+    if not is_full:
+        left_out = [view for view in others if view.kind not in EVIDENCE]
+        others = [view for view in others if view.kind in EVIDENCE]
+    annex = [_records_section(view, data.labels) for view in others]
     if data.verdict is not None:
         annex.append(_verdict_section(data.verdict, data.verdict_of_calibration))
-    if data.calibration is not None:
+    if data.calibration is not None and is_full:
         annex += [
             _reprojection_section(data.calibration),
             _parameters_section(data.calibration),
         ]
-    if data.pixel_fits:
+    if data.pixel_fits and is_full:
         text = (
             "Each camera pixel's own rational function from phase to depth, and lines from depth to"
             " x and y."
@@ -269,8 +276,12 @@ def session_sections(data: SessionData) -> list[Section]:
         annex.append(Section("Pixel-wise model", text, maps))
     if data.region or data.edits:
         annex.append(_restrictions_section(data))
-    annex += [_method_section(data), _captures_section(data)]
-    return [*_notice_section(data), *results, *(replace(each, is_annex=True) for each in annex)]
+    annex += [_method_section(data), *([_captures_section(data)] if is_full else [])]
+    return [
+        *_notice_section(data, left_out),
+        *results,
+        *(replace(each, is_annex=True) for each in annex),
+    ]
 
 
 def _parameters_section(calibration: CalibrationFigures) -> Section:
@@ -299,15 +310,22 @@ def _method_section(data: SessionData) -> Section:
     return Section("Method and terms", text, [*scales, table])
 
 
-def _notice_section(data: SessionData) -> list[Section]:
-    """The section with warnings and with captures that are not used; an empty list if there are
-    none."""
+def _notice_section(data: SessionData, left_out: Sequence[RecordsView]) -> list[Section]:
+    """The section with warnings, with captures that are not used, and with what is not good of
+    records that are ``left_out``; an empty list if there are none."""
+    known = {each.capture.name for each in data.captures if each.state == "known shape"}
+    doubts = [
+        f"{view.kind.title}, {data.labels.get(name, name)}: {each.summary()}"
+        for view in left_out
+        for name, each in view.records.items()
+        if not (each.is_good or (isinstance(each, Reconstruction) and name in known))
+    ]
     unused = [
         f"{each.capture.name} is {each.state}: {each.why or 'no reason was given'}"
         for each in data.captures
         if each.state in ("unused", "excluded")
     ]
-    items = list(map(PageNotice, [*data.warnings, *unused]))
+    items = list(map(PageNotice, [*data.warnings, *unused, *doubts]))
     return [Section("Warnings", "", items)] if items else []
 
 

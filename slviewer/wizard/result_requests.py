@@ -261,11 +261,12 @@ class ResultRequests(ChangeRequests):
         plan: MeshingPlan | None = None,
         texture: int | None = None,
         white: str = "",
+        is_full: bool = False,
     ) -> None:
         """Write a file into the session's exports. `export.formats` lists the formats, the first is
         the default. `name`: the scan of a cloud or a mesh, the model of coefficients; a merge is
         the current one. `plan`: how to mesh; `texture`: side of its image, px, of a .glb or .obj;
-        `white`: its white balance.
+        `white`: its white balance. `is_full`: of a report, with all of the annex.
         """
         store, chosen = self._store, file_format or formats(what)[0]
         check_export(what, chosen)
@@ -278,7 +279,7 @@ class ResultRequests(ChangeRequests):
 
         self._work(
             "Exporting",
-            lambda job: _export_file(job, what, name, chosen, plan, texture, white),
+            lambda job: _export_file(job, what, name, chosen, plan, texture, white, is_full),
             "measurements",
         )
 
@@ -468,6 +469,7 @@ def _export_file(
     plan: MeshingPlan | None,
     texture: int | None = None,
     white: str = "",
+    is_full: bool = False,
 ) -> WrittenFile:
     """Write one file, as `pipeline.export.export` does, or a mesh with a texture."""
     store, file_name = job.store, default_file_name(what, name, file_format)
@@ -477,7 +479,7 @@ def _export_file(
     }  # fmt: skip
     if texture is None:
         with store.staged_export(file_name) as path:
-            words = export(store, what, name, out=path, **options).words
+            words = export(store, what, name, out=path, full=is_full, **options).words
     else:
         source = f"{MERGED}{name}" if what == "merged-mesh" else name
         out = store.exports / file_name

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from facts import missing_facts
 from made_up import MODELS, planes, reproduction_data, session_data, spheres
+from playwright.sync_api import Browser
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.pipeline.accept import gather_results
@@ -27,6 +28,7 @@ from slviewer.records.inspection import (
     Inspection,
     PartResult,
 )
+from slviewer.records.merge import DepthCheck, Merge
 from slviewer.records.record import Cell, Table, better_worse, compare_errors
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Verification
@@ -280,6 +282,43 @@ def test_results_come_first_and_all_limits_decide() -> None:
     assert [section.title for section in sections if not section.is_annex] == [
         "Warnings", "Inspection"
     ]  # fmt: skip
+
+
+def test_a_customers_report_is_short_and_hides_no_doubt(tmp_path: Path, browser: Browser) -> None:
+    data, part = (
+        session_data(WIDTH),
+        PartResult("part_1", (CharacteristicResult("width", 1, 0.1, "pass"),)),
+    )
+    inspected = Inspection(plan="plate", characteristic=(WIDTH_WANTED,), parts=(part,))
+    depths = {"b": DepthCheck((500, 600), 0.3)}
+    merged = Merge(reference="a", scans=["a", "b"], pairs={}, points=9, ply="m.ply", depths=depths)
+    views = [
+        *data.records,
+        RecordsView(Inspection, {"1": inspected}),
+        RecordsView(Merge, {"1": merged}),
+    ]
+    data = dataclasses.replace(data, records=views)
+    pages = {}
+    for is_full in (False, True):
+        sections = session_sections(data, is_full=is_full)
+        titles = [section.title for section in sections]
+        warned = "Merges, 1: " in texts(sections[0]) and "outside the calibrated" in texts(
+            sections[0]
+        )
+        left_out = {"Verification", "Merges", "Reprojection", "Parameters", "Captures"}
+        assert warned is not is_full and (
+            left_out & set(titles) == (left_out if is_full else set())
+        )
+        assert titles[:2] == ["Warnings", "Inspection"] and "Method and terms" in titles
+        path = tmp_path / f"{is_full}.html"
+        write_page(
+            path, "Plate", "", session_headlines(data), sections, title_page=make_title_page(data)
+        )
+        page = browser.new_page()
+        page.goto(path.as_uri())
+        pages[is_full] = len(re.findall(rb"/Type\s*/Page\b", page.pdf()))
+        page.close()
+    assert 2 <= pages[False] <= 4 < pages[True]
 
 
 def test_the_title_page_counts_scans_of_the_part_alone() -> None:

@@ -184,6 +184,9 @@ class ExportPanel(StepPanel):
                 self._logo = self.button(
                     "Remove logo", lambda: operator.set_report_details(logo=""), "photo-off"
                 )
+            self._is_full = self.checkbox(
+                "Full annex", hint="Also the rig: verifications, models, captures, hashes"
+            )
             self._report = self.button("Write report", self._request_report, "report")
             self._table = self.button(
                 "Write figures",
@@ -337,7 +340,7 @@ class ExportPanel(StepPanel):
         except ValueError as error:
             raise InputError(f"{text!r} is not a temperature", "type °C, such as 20.5") from error
         if self._operator.set_report_details(**stated):
-            self._operator.export("report")
+            self._operator.export("report", is_full=self._is_full.value)
 
     def _request_shape(self) -> None:
         """Request the file of the chosen cloud or mesh."""
