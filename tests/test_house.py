@@ -16,6 +16,7 @@ PACKAGES = [
     "errors",
     "entry_points",
     "inputs",
+    "process",
     "printable",
     "records",
     "geometry",

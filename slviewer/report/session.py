@@ -2,7 +2,7 @@
 parts, with a trend chart of each characteristic."""
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -262,18 +262,8 @@ def session_sections(data: SessionData, *, is_full: bool = True) -> list[Section
     annex = [_records_section(view, data.labels) for view in others]
     if data.verdict is not None:
         annex.append(_verdict_section(data.verdict, data.verdict_of_calibration))
-    if data.calibration is not None and is_full:
-        annex += [
-            _reprojection_section(data.calibration),
-            _parameters_section(data.calibration),
-        ]
-    if data.pixel_fits and is_full:
-        text = (
-            "Each camera pixel's own rational function from phase to depth, and lines from depth to"
-            " x and y."
-        )
-        maps = [rms_maps(rms, axis) for axis, rms in data.pixel_fits.items()]
-        annex.append(Section("Pixel-wise model", text, maps))
+    if is_full:
+        annex += _calibration_sections(data)
     if data.region or data.edits:
         annex.append(_restrictions_section(data))
     annex += [_method_section(data), *([_captures_section(data)] if is_full else [])]
@@ -282,6 +272,20 @@ def session_sections(data: SessionData, *, is_full: bool = True) -> list[Section
         *results,
         *(replace(each, is_annex=True) for each in annex),
     ]
+
+
+def _calibration_sections(data: SessionData) -> Iterator[Section]:
+    """Yield the sections on the calibration's residuals and parameters."""
+    if data.calibration is not None:
+        yield _reprojection_section(data.calibration)
+        yield _parameters_section(data.calibration)
+    if data.pixel_fits:
+        text = (
+            "Each camera pixel's own rational function from phase to depth, and lines from depth to"
+            " x and y."
+        )
+        maps = [rms_maps(rms, axis) for axis, rms in data.pixel_fits.items()]
+        yield Section("Pixel-wise model", text, maps)
 
 
 def _parameters_section(calibration: CalibrationFigures) -> Section:

@@ -18,18 +18,9 @@ from slviewer.session.scan_edits import load_edits, load_region, save_region
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import Edit, select_support
-from slviewer.wizard.engine import (
-    Engine,
-    Step,
-    combine,
-    decide_step,
-    edit_step,
-    move_step,
-    request,
-    restore_step,
-    trash_step,
-)
+from slviewer.wizard.engine import Engine, request
 from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
+from slviewer.wizard.undo import Move, Restore, Several, Step, StepEdits, decide, remove
 
 _RESULTS_OF_CAPTURE = ("poses", "clouds", "verify", "trust", PLACEMENTS)
 
@@ -52,11 +43,12 @@ class ChangeRequests(Engine):
     def _make(self, name: str, step: Step) -> None:
         """Make a change of the session that can be undone, of this name."""
         store = self._store
-        self._add_change(store, name, step())
+        self._add_change(store, name, step.make(store))
 
     def _decide(self, name: str, what: str, change: Callable[[], object]) -> None:
         """Make a change of a decision of the session that can be undone, of this name."""
-        self._make(name, decide_step(self._store, what, change))
+        store = self._store
+        self._add_change(store, name, decide(store, what, change))
 
     def _finish(self, verb: str) -> Callable[[Findings[Any]], None]:
         """Return what adds the records that an operation made, numbered ones, to what can be
@@ -66,7 +58,7 @@ class ChangeRequests(Engine):
         def add(found: Findings[Any]) -> None:
             """Add the records."""
             labels = ", ".join(record.label(name) for name, record in found.items())
-            removal = self._removal(store, found.kind.kind, list(found))
+            removal = self._removal(found.kind.kind, list(found))
             self._add_change(store, f"{verb} {labels}", removal)
 
         return add
@@ -95,14 +87,15 @@ class ChangeRequests(Engine):
         store = self._store
         results = (f"{kind}/{name}" for kind in _RESULTS_OF_CAPTURE)
         names = [name, *(each for each in results if store.has_result(each))]
-        include = decide_step(store, "excluded", partial(store.include, name))
-        self._make(f"delete {self._label(name)}", combine(trash_step(store, names), include))
+        title, back = f"delete {self._label(name)}", remove(names).make(store)
+        included = decide(store, "excluded", partial(store.include, name))
+        self._add_change(store, title, Several([included, back]))
         self._queue_processing()
 
     @request("Restoring")
     def undelete(self, name: str) -> None:
         """Restore a deleted capture from the trash; its results are computed again."""
-        self._make(f"restore {self._label(name)}", restore_step(self._store, name))
+        self._make(f"restore {self._label(name)}", Restore(name))
         self._queue_processing()
 
     @request("Renaming")
@@ -136,7 +129,7 @@ class ChangeRequests(Engine):
         placement = f"{PLACEMENTS}/{name}"
         if self._store.has_result(placement):
             title = f"remove the alignment of {self._label(name)}"
-            self._make(title, trash_step(self._store, [placement]))
+            self._make(title, remove([placement]))
 
     def _last_merge(self, missing: str) -> str:
         """Return the number of the current merge. Raises InputError with ``missing`` without
@@ -150,17 +143,16 @@ class ChangeRequests(Engine):
     def undo_merge(self) -> None:
         """Move the current merge to the trash; the previous one is current again."""
         number = self._last_merge("there is no merge to undo")
-        removal = self._removal(self._store, Merge.kind, [number])
+        removal = self._removal(Merge.kind, [number])
         self._make(f"remove merge {number}", removal)
 
-    def _removal(self, store: Session, kind: str, names: Sequence[str]) -> Step:
+    def _removal(self, kind: str, names: Sequence[str]) -> Step:
         """Return the step that moves numbered records to the trash, a merge with its PLY."""
-        trash = trash_step(store, [f"{kind}/{name}" for name in names])
+        trash = remove([f"{kind}/{name}" for name in names])
         if kind != Merge.kind:
             return trash
         files = [f"merged_{name}.ply" for name in names]
-        moves = (move_step(store.exports / file, store.folder / "trash" / file) for file in files)
-        return combine(trash, *moves)
+        return Several([trash, *(Move(f"exports/{file}", f"trash/{file}") for file in files)])
 
     @request("Renaming")
     def relabel_measurement(self, name: str, label: str) -> None:
@@ -174,13 +166,13 @@ class ChangeRequests(Engine):
     def delete_measurement(self, name: str) -> None:
         """Move a measurement to the trash; what was made from it becomes stale."""
         label = load_stored(self._store, Measurement, name).label
-        self._make(f"delete {label}", self._removal(self._store, Measurement.kind, [name]))
+        self._make(f"delete {label}", self._removal(Measurement.kind, [name]))
 
     @request("Restoring")
     def undo_delete(self) -> None:
         """Bring the measurement back that was deleted last."""
         found = restore_measurement(self._store)
-        reverse = self._removal(self._store, Measurement.kind, [found.name])
+        reverse = self._removal(Measurement.kind, [found.name])
         self._add_change(self._store, f"restore {found.label}", reverse)
 
     # which points of scans are used
@@ -221,7 +213,7 @@ class ChangeRequests(Engine):
     def _add_edits(self, store: Session, name: str, edits: dict[str, Edit]) -> None:
         """Add edits that were made to what can be undone."""
         made = {scan: edit.made for scan, edit in edits.items()}
-        self._add_change(store, name, edit_step(store, made))
+        self._add_change(store, name, StepEdits(made))
 
     @request("Removing the support")
     def remove_support(self, *scans: str) -> None:
@@ -274,4 +266,4 @@ class ChangeRequests(Engine):
         """Undo or redo the last edit of scans."""
         made = step_history(self._store, scans, redo=redo)
         name = f"{'redo' if redo else 'undo'} the edit of {', '.join(made)}"
-        self._add_change(self._store, name, edit_step(self._store, made, not redo))
+        self._add_change(self._store, name, StepEdits(made, not redo))

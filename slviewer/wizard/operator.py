@@ -49,12 +49,13 @@ from slviewer.session.importers.archive import CLOUD_SUFFIXES, unpack, unpacked_
 from slviewer.session.importers.clouds import FORMATS
 from slviewer.session.names import new_name, plain_name
 from slviewer.session.reading import expand_user
-from slviewer.wizard.engine import combine, decide_step, exchange_step, request
+from slviewer.wizard.engine import request
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.result_requests import ResultRequests
 from slviewer.wizard.rig_requests import RigRequests
 from slviewer.wizard.service import Service, Timing
 from slviewer.wizard.snapshot import PreviewView, Snapshot
+from slviewer.wizard.undo import Several, decide, replaced_by
 
 IMPORTING = "Importing"
 BOARD_S = 10.0
@@ -222,8 +223,8 @@ class Operator(RigRequests, ResultRequests):
             save_frames(store, name, "pose", captured, board=target, force=bool(retaken))
             if retaken:
                 before = next(each.place for each in store.trashed() if each.name == name)
-                exclude = decide_step(store, "excluded", partial(store.include, name))()
-                back = combine(exclude, exchange_step(store, {name: before}))
+                excluded = decide(store, "excluded", partial(store.include, name))
+                back = Several([excluded, replaced_by(store, {name: before})])
                 self._add_change(store, f"retake {self._label(name)}", back)
             self._queue_processing()
 

@@ -32,6 +32,7 @@ from slviewer.wizard.acquisition import LIGHTS, ShownImage
 from slviewer.wizard.engine import Engine, remember_running, request
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import CalibrationView, ExposureChange, Level
+from slviewer.wizard.undo import UndoHistory
 
 T = TypeVar("T")
 _CHECKED: dict[CheckVerdict, tuple[Level, str]] = {
@@ -73,7 +74,7 @@ class RigRequests(Engine):
             self._acquisition.stop_stream()
             self._jobs.cancel_all()
             self._session_reader, self._queued = SessionReader(store, self._planner), set()
-            self._history.clear()
+            self._history = UndoHistory(store)
             self.show(merge_failure="")
             if before:
                 before.close()
@@ -83,6 +84,8 @@ class RigRequests(Engine):
                     "info",
                     f"{name} was complete when the program ended, and is in the session again",
                 )
+            if self._history.fault:
+                self._notices.add("warning", self._history.fault)
             if interrupted := store.valid_decision("running"):
                 remember_running(store, None)
                 self._notices.add(

@@ -1,6 +1,7 @@
 """What was done last is undone and redone, whatever it was, by name; nothing else changes, and
 nothing is lost."""
 
+import json
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -21,8 +22,8 @@ from slviewer.session.scan_edits import list_edits, load_edits
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard import result_requests
-from slviewer.wizard.engine import Step, UndoHistory
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.undo import UndoHistory, decide, remove
 
 SEQUENCE = PatternSequence((16, 12), tuple(phase_steps("x", 4, 8.0)))
 
@@ -64,42 +65,90 @@ def names(operator: Operator) -> tuple[str, str]:
     return now.next_undo, now.next_redo
 
 
-def test_a_history_moves_changes_between_undone_and_done() -> None:
-    history, values = UndoHistory(), ["a"]
+def test_a_history_moves_changes_between_undone_and_done(tmp_path: Path) -> None:
+    with Session.create(tmp_path / "session") as store:
+        history, values = UndoHistory(store), lambda: store.decision("model")
 
-    def assign(value: str) -> Step:
-        before, values[0] = values[0], value
-        return partial(assign, before)
+        def choose(value: str) -> None:
+            change = partial(store.decide, "model", value)
+            history.add(f"set {value}", decide(store, "model", change))
 
-    for value in ("b", "c"):
-        history.add(f"set {value}", assign(value))
-    assert history.undo() == "set c" and values == ["b"] and history.next_redo == "set c"
-    assert history.redo() == "set c" and values == ["c"]
-    assert [history.undo(), history.undo()] == ["set c", "set b"] and values == ["a"]
-    with pytest.raises(InputError):
-        history.undo()
-    assert history.redo() == "set b"
-    history.add("set d", assign("d"))
-    assert (history.next_undo, history.next_redo) == ("set d", "")
-    assert [history.undo(), history.undo()] == ["set d", "set b"] and values == ["a"]
-    history.clear()
-    assert (history.next_undo, history.next_redo) == ("", "")
+        store.decide("model", "a")
+        for value in ("b", "c"):
+            choose(value)
+        assert history.undo() == "set c" and values() == "b" and history.next_redo == "set c"
+        assert history.redo() == "set c" and values() == "c"
+        assert [history.undo(), history.undo()] == ["set c", "set b"] and values() == "a"
+        with pytest.raises(InputError):
+            history.undo()
+        assert history.redo() == "set b"
+        choose("d")
+        assert (history.next_undo, history.next_redo) == ("set d", "")
+        assert [history.undo(), history.undo()] == ["set d", "set b"] and values() == "a"
+        again = UndoHistory(store)  # as when the session is opened again
+        assert (again.next_undo, again.next_redo) == ("", "set b")
+        assert [again.redo(), again.redo()] == ["set b", "set d"] and values() == "d"
 
 
-def test_a_change_that_cannot_be_undone_is_forgotten_one_that_failed_stays() -> None:
-    history, errors = UndoHistory(), [SessionError("the disk is full"), InputError("it is gone")]
+def test_a_change_that_cannot_be_undone_is_forgotten_one_that_failed_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Session.create(tmp_path / "session") as store:
+        history = UndoHistory(store)
+        history.add("first", decide(store, "model", partial(store.decide, "model", "a")))
+        history.add("second", remove(["scan_01"]))  # which is not there
 
-    def fail() -> Step:
-        raise errors.pop(0)
+        def refuse(*_: object) -> None:
+            raise SessionError("the disk is full")
 
-    history.add("first", lambda: fail)
-    history.add("second", fail)
-    with pytest.raises(SessionError):
-        history.undo()
-    assert history.next_undo == "second"
-    with pytest.raises(InputError, match="second"):
-        history.undo()
-    assert history.undo() == "first"
+        with monkeypatch.context() as patch, pytest.raises(SessionError):
+            patch.setattr(Session, "exchange", refuse)
+            history.undo()
+        assert history.next_undo == "second"
+        with pytest.raises(InputError, match="second"):
+            history.undo()
+        assert UndoHistory(store).next_undo == "first" == history.undo()
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        {"type": "move", "source": "exports/a", "target": "../a"},
+        {"type": "move", "source": "/etc/passwd", "target": "exports/a"},
+        {"type": "exchange", "contents": {"scan_01": "trash/.."}},
+        {"type": "exchange", "contents": {"scan_01": "trash/../../a"}},
+        {"type": "unheard of"},
+        7,
+    ],
+)
+def test_a_file_of_changes_that_is_damaged_or_reaches_outside_is_forgotten_with_a_word(
+    tmp_path: Path, step: object
+) -> None:
+    folder = tmp_path / "session"
+    with Session.create(folder) as store:
+        add_capture(store, "scan_01", 1)
+    (folder / "trash").mkdir(exist_ok=True)
+    (folder / "trash" / "changes.json").write_text(json.dumps({"done": [["evil", step]]}))
+    with Operator(folder) as engine:
+        assert engine.wait_until_idle(HANG_S).next_undo == ""
+        warned = next(n.text for n in engine.notices() if "changes.json" in n.text)
+        assert missing_facts(warned, "cannot be undone") == []
+
+
+def test_changes_are_undone_after_the_session_was_opened_again(operator: Operator) -> None:
+    store = opened(operator)
+    before = state(operator)
+    assert operator.rename("scan_01", "Part A") and operator.delete("scan_02")
+    assert operator.exclude("scan_03", "blurred")
+    after, folder = state(operator), store.folder
+    operator.close()
+    moved = folder.rename(folder.with_name("moved"))
+    with Operator(moved) as again:
+        assert names(again) == ("exclude scan_03", "")
+        for name in ("exclude scan_03", "delete scan_02", "rename scan_01"):
+            assert names(again)[0] == name and again.undo()
+        assert state(again) == before and names(again) == ("", "rename scan_01")
+        assert again.redo() and again.redo() and again.redo() and state(again) == after
 
 
 def test_every_change_is_undone_and_redone_by_name(operator: Operator) -> None:
@@ -224,9 +273,9 @@ def test_a_calibration_that_was_replaced_comes_back(
     assert operator.redo() and contents() == after
 
 
-def test_another_session_begins_without_a_history(operator: Operator, tmp_path: Path) -> None:
+def test_each_session_has_a_history_of_its_own(operator: Operator, tmp_path: Path) -> None:
     assert operator.exclude("scan_01") and names(operator)[0]
     folder = opened(operator).folder
     assert operator.open_session(tmp_path / "other") and names(operator) == ("", "")
-    assert operator.open_session(folder) and names(operator) == ("", "")
-    assert not operator.undo() and "scan_01" in opened(operator).excluded()
+    assert operator.open_session(folder) and names(operator) == ("exclude scan_01", "")
+    assert operator.undo() and "scan_01" not in opened(operator).excluded()
