@@ -27,8 +27,10 @@ from slviewer.geometry.rigid import (
     Floats,
     coverage_radius,
     fit_rigid,
+    invert,
     motion_jacobian,
     move_points,
+    rigid_transform,
 )
 from slviewer.geometry.vectors import box_middle, finite_rows
 from slviewer.pipeline.accept import LEAST_FEATURES, interpolate_points, map_board_phase
@@ -43,9 +45,11 @@ from slviewer.pipeline.models import (
     load_model,
     load_stereo,
 )
-from slviewer.pipeline.operation import Found, Job, list_records, operation
+from slviewer.pipeline.operation import Found, Job, list_records, load_record, operation
 from slviewer.pipeline.poses import read_stored_poses
+from slviewer.pipeline.reconstruct import merge_name
 from slviewer.records.machine import HandEye, HandEyePose, MachinePose, PlannedPose
+from slviewer.records.merge import Merge
 from slviewer.records.record import to_matrix, to_vector
 from slviewer.session.importers.pose_files import (
     AngleUnit,
@@ -69,6 +73,8 @@ class HandEyeSettings:
             reads it; by default the poses that it stored.
         mounting: eye-in-hand: the camera is on the flange, and the board is fixed; eye-to-hand: the
             camera is fixed, and the board is on the flange.
+        merge: Merge, as merge/1, of scans of a part in place of captures of a board: how its
+            surfaces were registered says how the camera moved.
         convention: How the rotations are written, where their columns do not state it: matrix,
             quaternion-wxyz, quaternion-xyzw, abb, kuka, fanuc or ur.
         unit: Of lengths; by default as the header states, else m of ur and mm of all others.
@@ -84,6 +90,7 @@ class HandEyeSettings:
 
     poses: Path | str | None = None
     mounting: Mounting = "eye-in-hand"
+    merge: str = ""
     convention: Convention | None = None
     unit: LengthUnit | None = None
     angles: AngleUnit | None = None
@@ -108,20 +115,29 @@ class RobotPoses:
 
 @operation("hand-eye", HandEye, HandEyeSettings)
 def hand_eye(job: Job, settings: HandEyeSettings) -> Iterator[Found[HandEye]]:
-    """Find the place of the camera on a robot from captures of the board, with its uncertainty.
+    """Find the place of the camera on a robot from captures of the board, or of any part, with its
+    uncertainty.
 
     Scans are merged and exported in the robot's frame then. Reports the residual of each pose, and
     those that move nothing new.
     """
     store = job.store
     check_calibration(job)
-    model = load_model(store, settings.model)
-    given = _read_robot_poses(store, settings)
-    boards, skipped, symmetry = measure_boards(job.part(0.0, 0.9), model, given.names)
+    if settings.merge:
+        number = merge_name(store, settings.merge)
+        merge = load_record(store, Merge, number)
+        given = _read_robot_poses(store, settings, merge.scans)
+        boards, skipped = _place_part(merge)
+        of, symmetry, model, own = "part", 1, merge.model, {f"{Merge.kind}/{number}"}
+    else:
+        loaded = load_model(store, settings.model)
+        given = _read_robot_poses(store, settings, store.capture_names("calibration"))
+        boards, skipped, symmetry = measure_boards(job.part(0.0, 0.9), loaded, given.names)
+        of, model, own = "board", loaded.name, set[str]()
     rows = [k for k, name in enumerate(given.names) if name in boards]
     if not rows:
         raise InputError(
-            f"the board could not be measured in any of the {len(given.names)} captures that have a"
+            f"the {of} could not be measured in any of the {len(given.names)} captures that have a"
             " pose of the robot",
             "; ".join(f"{name}: {why}" for name, why in list(skipped.items())[:3]),
         )
@@ -141,9 +157,9 @@ def hand_eye(job: Job, settings: HandEyeSettings) -> Iterator[Found[HandEye]]:
     for name, why in fit.excluded.items():
         job.warn(f"{name} is excluded: {why}; did something move, or was its pose read elsewhere?")
     record = make_record(fit, PLANNED if settings.plan else 0)
-    used = describe_calibration(store, model.name, names)
+    used = describe_calibration(store, model, [*names, *own])
     origin = {key: used[key] for key in ("model", "scales", "inputs")}
-    frame = frame_of(store, model.name)
+    frame = frame_of(store, model)
     yield Found("", msgspec.structs.replace(record, frame=frame, skipped=skipped, **origin))
 
 
@@ -183,16 +199,37 @@ def make_record(fit: HandEyeFit, plan: int = 0) -> HandEye:
     )
 
 
-def _read_robot_poses(store: Session, settings: HandEyeSettings) -> RobotPoses:
-    """Return the poses of the file, or the imported ones, of the captures of the board. Raises
-    InputError where there are none."""
-    captures = store.capture_names("calibration")
+def _place_part(merge: Merge) -> tuple[dict[str, tuple[Floats, Floats]], dict[str, str]]:
+    """Return T_camera_part (4, 4) mm of the scans of a merge, from the middle of their overlaps,
+    and the covariance (6, 6) of small motions in the part's frame; and why others were skipped."""
+    registered = {name: pair for name, pair in merge.pairs.items() if pair.middle}
+    skipped = {
+        name: "its surface was not registered: the machine alone placed it"
+        for name in merge.pairs.keys() - registered.keys()
+    }
+    if not registered:
+        return {}, skipped
+    middle = np.mean(np.array([pair.middle for pair in registered.values()], float), axis=0)
+    T_reference_part = rigid_transform(np.eye(3), middle)
+    placed = {merge.reference: (T_reference_part, np.zeros((6, 6)))}
+    for name, pair in registered.items():
+        turn, shift = np.radians(pair.sigma_turn_deg or 0.0), pair.sigma_shift_mm or 0.0
+        T_scan_part = invert(np.array(pair.T_reference_scan)) @ T_reference_part
+        placed[name] = T_scan_part, np.diag([turn**2] * 3 + [shift**2] * 3)
+    return placed, skipped
+
+
+def _read_robot_poses(
+    store: Session, settings: HandEyeSettings, captures: Sequence[str]
+) -> RobotPoses:
+    """Return the poses of the file, or the imported ones, of the captures. Raises InputError where
+    there are none."""
     if settings.poses is None:
         found = [each for each in list_records(store, MachinePose) if each.name in captures]
         stored = {each.name: each.record for each in found if each.record.of == "robot"}
         if not stored:
             raise InputError(
-                "no pose of a robot is stored with the captures of the board",
+                f"no pose of a robot is stored with {', '.join(list(captures)[:3])} ...",
                 "give --poses FILE, or `slviewer import poses` first",
             )
         first = next(iter(stored.values()))
@@ -207,8 +244,7 @@ def _read_robot_poses(store: Session, settings: HandEyeSettings) -> RobotPoses:
     file, poses = Path(settings.poses).name, read.poses()
     if not read.names and len(poses) != len(captures):
         raise InputError(
-            f"{file} holds {len(poses)} poses without names, for {len(captures)} captures of the"
-            " board",
+            f"{file} holds {len(poses)} poses without names, for {len(captures)} captures",
             "add a column capture with their names",
         )
     matched, _ = match_captures(read.names, captures, file)

@@ -31,13 +31,16 @@ class HandEyePanel(PanelPlugin):
             read_hint(HandEyeSettings, "convention"),
             {"as the file states": None, **{each: each for each in get_args(Convention)}},
         )
+        self._merge = self._gui.add_text(
+            "Merge", "", hint=read_hint(HandEyeSettings, "merge")
+        )
         self._form = Form(self, HandEyeSettings)
-        self._plan = self.checkbox("Plan six further poses", read_hint(HandEyeSettings, "plan"))
+        self._plan = self.checkbox("Plan poses", read_hint(HandEyeSettings, "plan"))
         self._found = Text(self._gui)
         self.button(
             "Calibrate hand-eye",
             self._calibrate,
-            hint="Finds where the camera is on the robot, by these poses and the captured boards",
+            hint="Finds the camera on the robot, by these poses and the boards or the merge",
         )
 
     def draw(self) -> None:
@@ -50,6 +53,7 @@ class HandEyePanel(PanelPlugin):
             "hand-eye",
             poses=self._file.value or None,
             mounting=self._mounting.value,
+            merge=self._merge.value,
             convention=self._convention.value or None,
             plan=self._plan.value,
             **self._form.values(),

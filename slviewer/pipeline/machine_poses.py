@@ -32,8 +32,8 @@ from slviewer.session.importers.pose_files import (
 )
 from slviewer.session.store import Session
 
-SIGMA_MM = Input(1e-6, 1e3, "mm")
-SIGMA_DEG = Input(1e-6, 180.0, "°")
+SIGMA_MM = Input(1e-6, 1e3, "mm", "Sigma")
+SIGMA_DEG = Input(1e-6, 180.0, "°", "Sigma")
 PoseOf = Literal["robot", "scan"]
 
 

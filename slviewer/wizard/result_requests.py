@@ -185,18 +185,21 @@ class ResultRequests(ChangeRequests):
         reference: str,
         *,
         start: StartKind = "features",
+        fixed: bool = False,
         angle: float | None = None,
         picked: Picked | None = None,
     ) -> None:
         """Register scans, in the order in which they were captured, to a reference, and merge them.
 
         The snapshot shows why a merge failed until the next one. `start`,
-        `angle` and `picked` as in `pipeline.merge`.
+        `fixed`, `angle` and `picked` as in `pipeline.merge`.
         """
         chosen = self._check_names(names)
         failed = self._begin_merge("picked" if picked else start)
         try:
-            settings = MergeSettings(chosen, reference, start=start, angle=angle, picked=picked)
+            settings = MergeSettings(
+                chosen, reference, start=start, fixed=fixed, angle=angle, picked=picked
+            )
         except SlviewerError as error:
             failed(error)
             return

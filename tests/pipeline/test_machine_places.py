@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clocks import HANG_S
 from scipy.spatial.transform import Rotation
 
 import slviewer as sl
@@ -13,6 +14,7 @@ from slviewer.pipeline.operation import load_stored, next_name, save_record
 from slviewer.records.machine import HandEye
 from slviewer.records.merge import Merge
 from slviewer.session.store import Session
+from slviewer.wizard.operator import Operator
 from tests.proofs.hand_eye import rigid
 
 pytestmark = pytest.mark.computes
@@ -118,6 +120,12 @@ def test_scans_without_overlap_are_merged_where_the_machine_has_them(tmp_path: P
     (check,) = record.machine
     assert check.is_used and check.why and record.pairs["b"].rms_mm is None
     assert record.points > 10_000 and "placed by the machine" in record.summary()
+    with Operator(session) as operator:  # the wizard does the same
+        for fixed in (False, True):
+            assert operator.merge(["a", "b"], "a", start="machine", fixed=fixed)
+            shown = operator.wait_until_idle(HANG_S)
+            assert bool(shown.merge_failure) is not fixed
+        assert shown.content.merge is not None and shown.content.merge.record.machine == [check]
 
 
 def test_fixed_places_need_a_machine(tmp_path: Path) -> None:

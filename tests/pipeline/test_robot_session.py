@@ -7,12 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from copies import copy_session
-from facts import missing_facts
+from facts import missing_facts, raises
 from scipy.spatial.transform import Rotation
 
 import slviewer as sl
+from slviewer.errors import InputError
 from slviewer.operations.hand_eye import hand_eye
+from slviewer.pipeline.operation import save_record
 from slviewer.records.machine import MachinePose
+from slviewer.records.merge import Merge, Registered
+from slviewer.records.record import to_matrix, to_vector
 from slviewer.session.store import Session
 from tests.proofs.hand_eye import disturb, rigid
 
@@ -78,3 +82,39 @@ def test_imported_poses_give_the_same(session: Path, tmp_path: Path) -> None:
     )
     assert np.allclose(one.T_carrier_camera, other.T_carrier_camera)
     assert one.U_mm == pytest.approx(other.U_mm)
+
+
+def test_a_part_serves_in_place_of_the_board(session: Path, tmp_path: Path) -> None:
+    X, robot = place_robot(session)
+    truth = json.loads((session / "truth.json").read_text())["poses"]
+    boards = {name: np.array(truth[name]["T_camera_board"]) for name in robot}
+    first, *others = robot
+    middle = boards[first][:3, 3]
+    rng = np.random.default_rng(5)
+    pairs = {}
+    for name in others:
+        T = boards[first] @ np.linalg.inv(boards[name])
+        about = np.eye(4)
+        about[:3, 3] = middle
+        noisy = about @ disturb(rng, np.linalg.inv(about)[None] @ T, 0.02, 0.005)[0]
+        pairs[name] = Registered(
+            rms_mm=0.02, overlap=0.8, T_reference_scan=to_matrix(noisy), sigma_shift_mm=0.02,
+            sigma_turn_deg=0.005, middle=to_vector(middle),
+        )  # fmt: skip
+    pairs[others[-1]] = Registered(rms_mm=None, overlap=0.0, T_reference_scan=to_matrix(np.eye(4)))
+    with Session.open(session, write=True) as store:
+        merged = Merge(
+            reference=first, scans=[*robot], pairs=pairs, model="stereo", points=9, ply="m.ply",
+            inputs=store.input_hashes(*robot),
+        )  # fmt: skip
+        save_record(store, "1", merged, {})
+    file = write_kuka(tmp_path / "robot.csv", robot)
+    (found,) = hand_eye(
+        session, poses=file, merge="merge/1", sigma_mm=0.02, sigma_deg=0.005
+    ).values()
+    error = np.array(found.T_carrier_camera)[:3, 3] - X[:3, 3]
+    assert 0 < np.linalg.norm(error) < found.U_mm < 0.5 and found.ratio < 1.5
+    assert list(found.skipped) == [others[-1]] and "machine alone" in found.skipped[others[-1]]
+    assert "merge/1" in found.inputs and len(found.poses) == len(robot) - 1
+    with raises(InputError, "there is no merge '7'"):
+        hand_eye(session, poses=file, merge="7")

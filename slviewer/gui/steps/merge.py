@@ -32,6 +32,7 @@ from slviewer.wizard.snapshot import ScanView, SessionView
 
 FEATURES, MARKERS, PLACED, TURNTABLE = "features", "markers", "places while scanning", "turntable"
 CURRENT, PICKED, MACHINE = "current position", "picked points", "machine's poses"
+KEPT = "machine's poses, kept"
 STARTS: dict[str, StartKind] = {
     FEATURES: "features",
     MARKERS: "markers",
@@ -39,6 +40,7 @@ STARTS: dict[str, StartKind] = {
     TURNTABLE: "turntable",
     CURRENT: "identity",
     MACHINE: "machine",
+    KEPT: "machine",
     PICKED: "features",
 }
 """Initial alignments by what they are called here; picked points take the place of features."""
@@ -48,6 +50,7 @@ _START_NOTES = {
         "For coded markers on or beside the object, three or more in common: slviewer target"
         " markers:0-23:20 draws them."
     ),
+    KEPT: "The surfaces do not move the scans; where they place them elsewhere is stated.",
     CURRENT: "For scans between which neither the object nor the camera moved, or hardly.",
 }
 
@@ -294,6 +297,7 @@ class MergePanel(StepPanel):
             [scan.name for scan in scans],
             self._reference.value,
             start=STARTS[start],
+            fixed=start == KEPT,
             angle=float(self._angle.value) if needs_angle else None,
             picked=self._picker.picked() if start == PICKED else None,
         )
