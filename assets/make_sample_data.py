@@ -49,7 +49,7 @@ class Recipe:
 
 RECIPES = {
     "sample": Recipe(
-        0.15, 0.0, 6, 4, {"scan": ("plane_04",), "sphere": ("sphere_3",), "object": ("object_r2",)}
+        0.15, 0.0, 8, 4, {"scan": ("plane_04",), "sphere": ("sphere_3",), "object": ("object_r2",)}
     ),
     "letter": Recipe(
         0.5,

@@ -31,9 +31,7 @@ class HandEyePanel(PanelPlugin):
             read_hint(HandEyeSettings, "convention"),
             {"as the file states": None, **{each: each for each in get_args(Convention)}},
         )
-        self._merge = self._gui.add_text(
-            "Merge", "", hint=read_hint(HandEyeSettings, "merge")
-        )
+        self._merge = self._gui.add_text("Merge", "", hint=read_hint(HandEyeSettings, "merge"))
         self._form = Form(self, HandEyeSettings)
         self._plan = self.checkbox("Plan poses", read_hint(HandEyeSettings, "plan"))
         self._found = Text(self._gui)

@@ -30,10 +30,10 @@ class Dataset:
 
 
 SAMPLE = Dataset(
-    "97c69a2d436351e9d8096a9afaa5b0a17a919a358f9ed0b9039709fe03f95514",
+    "f0e00a31509568ae3265d4c1284b0593d815894399a77fd1dc858c6b7a739d8d",
     archive="datasets/sample.zip",
 )
-"""Six target poses, a plane, a sphere and an object, simulated at 240x180 px."""
+"""Eight target poses, a plane, a sphere and an object, simulated at 240x180 px."""
 
 
 def datasets() -> dict[str, Dataset]:

@@ -15,6 +15,8 @@ from facts import missing_facts, raises
 import slviewer as sl
 from slviewer.cli import main
 from slviewer.pipeline import datasets
+from slviewer.pipeline.models import recommended_model
+from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
 
 
@@ -65,9 +67,18 @@ def released(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[s
 def test_the_sample_is_unpacked_into_the_cache_once(cache: Path) -> None:
     folder = sl.datasets.fetch("sample")
     assert folder.parent == cache and list(cache.iterdir()) == [folder]
-    assert len(sl.read_captures(folder / "poses")) == 6
+    assert len(sl.read_captures(folder / "poses")) == 8
     before = folder.stat().st_mtime_ns
     assert sl.datasets.fetch("sample") == folder and folder.stat().st_mtime_ns == before
+
+
+@pytest.mark.computes
+def test_the_sample_is_calibrated_with_the_best_model(tmp_path: Path) -> None:
+    folder, session = sl.datasets.fetch("sample"), tmp_path / "session"
+    sl.import_captures(folder / "poses", session, role="calibration")
+    sl.calibrate(session, "circles:21x16:9")
+    with Session.open(session) as store:
+        assert recommended_model(store) == "splined"
 
 
 def test_a_given_folder_is_made_and_never_overwritten(tmp_path: Path) -> None:
@@ -94,7 +105,7 @@ def test_an_unknown_name_and_a_wrong_hash_are_refused(
 def test_a_released_data_set_is_downloaded_once(tmp_path: Path, released: list[str]) -> None:
     shares: list[float] = []
     folder = sl.datasets.fetch("letter", progress=lambda done, doing: shares.append(done))
-    assert len(sl.read_captures(folder / "poses")) == 6
+    assert len(sl.read_captures(folder / "poses")) == 8
     assert len(shares) > 20 and shares == sorted(shares) and shares[-1] == pytest.approx(1)
     assert sl.datasets.fetch("letter") == folder
     assert (sl.datasets.fetch("letter", tmp_path / "copy") / "scan" / "sequence.toml").is_file()
