@@ -10,6 +10,7 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
@@ -470,15 +471,17 @@ class LiveImage(Picture):
 
     is_large = False
     _camera_px = 0
+    _numbers = count()
 
     def __init__(self, gui: viser.GuiApi) -> None:
-        self._marker = Text(gui)
+        self._marker, self._number = Text(gui), next(self._numbers)
         super().__init__(gui)
 
     def set(self, image: np.ndarray, legend: str = "") -> None:
         """Show an image and its legend."""
         size = "large" if self.is_large else "small"
-        self._marker.set(f'<div data-live="{size}" data-camera-px="{self._camera_px}"></div>')
+        known = f'data-image="{self._number}" data-camera-px="{self._camera_px}"'
+        self._marker.set(f'<div data-live="{size}" {known}></div>')
         ratio = image.shape[0] / image.shape[1]
         below = f'<div data-live-legend style="--ratio:{ratio:.4f}">{legend}</div>'
         super().set(image, below)

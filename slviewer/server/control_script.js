@@ -14,7 +14,7 @@
     document.documentElement.style.setProperty("--view-width", `${box.width}px`);
   });
   let view = null;
-  let liveSize = ""; // chosen by a click, until no live image is shown: the server writes its marker anew with each camera
+  const liveSizes = {}; // chosen by a click, of each step's image: the server writes its marker anew with each camera
   const complete = () => {
     const canvas = document.querySelector("canvas");
     if (canvas && canvas !== view) size.observe((view = canvas));
@@ -22,9 +22,8 @@
       if (buttonHints.has(button.id)) button.title = buttonHints.get(button.id);
     for (const label of document.querySelectorAll(FOLDER))
       name(label, { role: "button", tabindex: 0, "aria-expanded": !label.querySelector(".tabler-icon-chevron-down") });
-    const markers = document.querySelectorAll("[data-live]");
-    if (!markers.length) liveSize = "";
-    if (liveSize) for (const marker of markers) name(marker, { "data-live": liveSize });
+    for (const marker of document.querySelectorAll("[data-live]"))
+      name(marker, { "data-live": liveSizes[marker.dataset.image] ?? marker.dataset.live });
     for (const image of document.querySelectorAll(LIVE))
       name(image, { role: "button", tabindex: 0, "aria-label": "Camera image", title: "Click to enlarge or shrink" });
     for (const label of document.querySelectorAll("label[for]"))
@@ -67,7 +66,7 @@
   });
   document.addEventListener("click", ({ target }) => {
     const marker = target.closest(CORNER)?.previousSibling.firstChild; // the corner: a new picture may have come meanwhile
-    if (marker) marker.dataset.live = liveSize = marker.dataset.live === "large" ? "small" : "large";
+    if (marker) marker.dataset.live = liveSizes[marker.dataset.image] = marker.dataset.live === "large" ? "small" : "large";
   });
   document.addEventListener("keydown", event => {
     if ((event.key === "Enter" || event.key === " ") && event.target.matches(`${FOLDER}, ${LIVE}`)) {

@@ -67,3 +67,24 @@ def test_the_lens_states_pixel_and_grey_level(browser: Browser) -> None:
     page.locator("#plot").hover()
     expect(lens).to_have_count(0)
     page.close()
+
+
+def test_the_size_of_a_live_image_stays_as_chosen_while_it_comes_and_goes(browser: Browser) -> None:
+    page = browser.new_page()
+    page.set_content(PAGE % PAGE_SCRIPT.decode())
+
+    def show(image: int | None) -> str | None:
+        """Write the marker as the server does; returns which size the page makes of it."""
+        marker = "" if image is None else f'<div data-live="small" data-image="{image}"></div>'
+        page.locator("div").first.evaluate("(place, text) => (place.innerHTML = text)", marker)
+        shown = page.locator("[data-live]")
+        return shown.get_attribute("data-live") if image is not None else None
+
+    assert show(1) == "small"
+    page.locator("#live").click()
+    assert show(1) == "large"
+    assert show(None) is None  # the rig is opened again, for example
+    assert show(1) == "large" and show(2) == "small"  # each step has an image of its own
+    page.locator("#live").press("Enter")
+    assert [show(each) for each in (None, 2, 1)] == [None, "large", "large"]
+    page.close()
