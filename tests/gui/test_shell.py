@@ -114,7 +114,8 @@ def test_live_image_is_enlarged_by_click_and_by_key(opened: Opened) -> None:
         box = image.bounding_box()  # None while a new picture takes its place
         return box["width"] if box else 0.0
 
-    wait_until(page, lambda: 0 < width() < 0.3 * SIZE["width"])  # the rig is open: a thumbnail
+    expect(page.get_by_text("done", exact=True)).to_be_visible()  # the rig is open: a thumbnail
+    wait_until(page, lambda: 0 < width() < 0.3 * SIZE["width"])
     image.click()
     wait_until(page, lambda: width() > 0.3 * SIZE["width"])
     image.press("Enter")
