@@ -229,7 +229,7 @@ def _read_robot_poses(
         stored = {each.name: each.record for each in found if each.record.of == "robot"}
         if not stored:
             raise InputError(
-                f"no pose of a robot is stored with {', '.join(list(captures)[:3])} ...",
+                f"no pose of a robot is stored with any of the {len(captures)} captures",
                 "give --poses FILE, or `slviewer import poses` first",
             )
         first = next(iter(stored.values()))

@@ -3,11 +3,7 @@ them.
 
 The requests are methods of its subclasses (the `*_requests`, `operator`), which alone write the
 state; panels see snapshots. `request` makes a method a request: granted or refused at once, without
-raising.
-
-What was done last can be undone: a step makes a change of the session, and returns the step that
-reverses it. The history is kept in memory: it ends with the program, and another session begins
-with an empty one.
+raising. What was done last in a session can be undone (`undo`).
 """
 
 import threading
