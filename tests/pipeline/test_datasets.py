@@ -37,6 +37,13 @@ class Files(SimpleHTTPRequestHandler):
         self.requested.append(self.path)
 
 
+class Server(ThreadingHTTPServer):
+    """Serves in threads, and says nothing of clients that leave in the middle of a file."""
+
+    def handle_error(self, *_: object) -> None:
+        """Ignore it: stderr may belong to the next test."""
+
+
 @pytest.fixture
 def released(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """A release on a server of the loopback address that offers the sample as ``letter``; yields
@@ -46,7 +53,7 @@ def released(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[s
     served.mkdir()
     (served / "letter.zip").write_bytes(data)
     Files.requested = []
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Files, directory=str(served)))
+    server = Server(("127.0.0.1", 0), partial(Files, directory=str(served)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     record = {
         "url": f"http://127.0.0.1:{server.server_port}/letter.zip",
