@@ -50,10 +50,8 @@ def call_apart(function: Callable[..., T], *arguments: Any, progress: Callable[.
                     if last is not None:
                         progress(*last)
                 kind, value = answer.result()
-                if kind == "raised":
-                    raise value
-                if kind == "returned":
-                    return value  # type: ignore[no-any-return]
+                if kind != "reported":
+                    break
                 progress(*(last := value))
         except (EOFError, BrokenPipeError, pickle.UnpicklingError) as error:
             raise SlviewerError(
@@ -62,21 +60,26 @@ def call_apart(function: Callable[..., T], *arguments: Any, progress: Callable[.
             ) from error
         finally:
             process.kill()
+    if kind == "raised":
+        raise value
+    return value  # type: ignore[no-any-return]
 
 
 def _answer() -> None:
-    """Compute what standard input asks for; standard output tells of progress and result."""
-    with os.fdopen(os.dup(1), "wb") as told:
+    """Compute what standard input asks for; report progress and result on standard output."""
+    with os.fdopen(os.dup(1), "wb") as output:
         os.dup2(2, 1)  # what libraries print
 
-        def tell(kind: str, value: object) -> None:
+        def report(kind: str, value: object) -> None:
             """Send one message."""
-            told.write(pickle.dumps((kind, value), pickle.HIGHEST_PROTOCOL))
-            told.flush()
+            output.write(pickle.dumps((kind, value), pickle.HIGHEST_PROTOCOL))
+            output.flush()
 
         function, arguments = pickle.load(sys.stdin.buffer)  # noqa: S301 (of the parent)
         try:
-            tell("returned", function(*arguments, progress=lambda *last: tell("reported", last)))
+            report(
+                "returned", function(*arguments, progress=lambda *last: report("reported", last))
+            )
         except Exception as error:
             error.add_note(traceback.format_exc())
-            tell("raised", error)
+            report("raised", error)

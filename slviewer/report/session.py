@@ -255,9 +255,9 @@ def session_sections(data: SessionData, *, is_full: bool = True) -> list[Section
     views = {view.kind: view for view in data.records}
     results = [_records_section(views.pop(kind), data.labels) for kind in RESULTS if kind in views]
     first = [views.pop(kind) for kind in ANNEX if kind in views]
-    others, left_out = [*first, *views.values()], list[RecordsView]()
+    others, skipped = [*first, *views.values()], list[RecordsView]()
     if not is_full:
-        left_out = [view for view in others if view.kind not in EVIDENCE]
+        skipped = [view for view in others if view.kind not in EVIDENCE]
         others = [view for view in others if view.kind in EVIDENCE]
     annex = [_records_section(view, data.labels) for view in others]
     if data.verdict is not None:
@@ -268,7 +268,7 @@ def session_sections(data: SessionData, *, is_full: bool = True) -> list[Section
         annex.append(_restrictions_section(data))
     annex += [_method_section(data), *([_captures_section(data)] if is_full else [])]
     return [
-        *_notice_section(data, left_out),
+        *_notice_section(data, skipped),
         *results,
         *(replace(each, is_annex=True) for each in annex),
     ]
@@ -314,13 +314,13 @@ def _method_section(data: SessionData) -> Section:
     return Section("Method and terms", text, [*scales, table])
 
 
-def _notice_section(data: SessionData, left_out: Sequence[RecordsView]) -> list[Section]:
+def _notice_section(data: SessionData, skipped: Sequence[RecordsView]) -> list[Section]:
     """The section with warnings, with captures that are not used, and with what is not good of
-    records that are ``left_out``; an empty list if there are none."""
+    records whose sections are ``skipped``; an empty list if there are none."""
     known = {each.capture.name for each in data.captures if each.state == "known shape"}
     doubts = [
         f"{view.kind.title}, {data.labels.get(name, name)}: {each.summary()}"
-        for view in left_out
+        for view in skipped
         for name, each in view.records.items()
         if not (each.is_good or (isinstance(each, Reconstruction) and name in known))
     ]
