@@ -125,6 +125,7 @@ class ScanPanel(StepPanel):
         self._gallery = Text(gui)
         with gui.add_folder("Cloud") as self._cloud_folder:
             self._scan = scan = self.choice("Scan")
+            scan.handle.on_update(self._keep_choice)
             self._figures = Text(gui)
             self._colour = self.dropdown("Colour", SCAN_COLOURINGS)
             self._legend = Text(gui)
@@ -185,17 +186,23 @@ class ScanPanel(StepPanel):
             self._gallery.set("")
             self._clear_cloud()
             return
-        reconstructed = [scan.name for scan in scans if scan.cloud != "absent"]
+        reconstructed = _reconstructed_names(session)
         self._scan.offer(scan_options(scans), (reconstructed or [""])[0])
         if new := [name for name in reconstructed if name not in self._known]:
             if self._known:  # show what was just reconstructed
                 self._scan.choose(new[0])
-            self._known = tuple(reconstructed)
+            self._known = reconstructed
         if calibration:
             self._model.offer_names(calibration.models, calibration.best)
         else:
             self._model.offer_names(())
         self._draw_scan(next(scan for scan in scans if scan.name == self._scan.value))
+
+    async def _keep_choice(self, event: Any) -> None:
+        """Know what is there when a user chooses a scan: drawn later, it must not take the choice
+        back. Viser calls this before it handles anything else."""
+        if event.client_id is not None:
+            self._known = _reconstructed_names(self._operator.snapshot().content)
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image, and whether what is known of it is at the calibrated depths."""
@@ -398,6 +405,11 @@ class ScanPanel(StepPanel):
             self._point.set(point_html(cloud, u, v))
             text = f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm"
             self.layer.mark("picked", cloud.points[v, u], text)
+
+
+def _reconstructed_names(session: SessionView) -> tuple[str, ...]:
+    """Return the names of the scans that have a cloud."""
+    return tuple(scan.name for scan in sort_scans(session.scans) if scan.cloud != "absent")
 
 
 def aligned_html(aligned: AlignedScans) -> Html:
