@@ -62,6 +62,9 @@ RELATIVE = 1e-3
 otherwise."""
 ABSOLUTE = 2e-6
 """... and in the figure's own unit, mm or px."""
+COUNT_SCATTER = 0.05
+"""... and of a count, as a share of its square root: where few are counted, all have to agree; of
+many, one may lie on either side of its limit by rounding."""
 _MAX_REPORT_BYTES = 1 << 28
 FRAMES = "frames of "
 _BY_OPERATOR = ("excluded by the operator", "not among the poses", "excluded for this calibration")
@@ -421,7 +424,9 @@ def _compare(
         return CheckedItem(name, "not recomputed", reason)
     for key, value in given.items():
         now = made.get(key, np.nan)
-        if not np.isclose(now, value, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True):
+        is_count = now == np.round(now) and value == np.round(value)
+        least = COUNT_SCATTER * np.sqrt(abs(value)) if is_count else ABSOLUTE
+        if not np.isclose(now, value, rtol=RELATIVE, atol=least, equal_nan=True):
             return CheckedItem(name, "differs", f"{key}: {value:.6g} in the report, {now:.6g} now")
     return CheckedItem(name, "same", f"{len(given)} figures")
 

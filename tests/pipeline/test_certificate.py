@@ -16,7 +16,13 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certificate, verify_report
+from slviewer.pipeline.certificate import (
+    ReportCheck,
+    _compare,
+    certify_page,
+    read_certificate,
+    verify_report,
+)
 from slviewer.pipeline.inspect_parts import run_plan
 from slviewer.pipeline.measure import load_surface, relate
 from slviewer.pipeline.operation import Job
@@ -171,6 +177,21 @@ def test_other_frames_are_found(
     status, out, error = run("verify-report", folder, certified[1])
     assert status == 1 and not missing_facts(error, "frames of plane_01", "frames of sphere_3")
     assert not missing_facts(out, "frames of plane_01", "frame 8", "frames of sphere_3")
+
+
+@pytest.mark.parametrize(
+    ("given", "made", "state"),
+    [
+        (534, 533, "same"),  # a value at its limit, rounded otherwise
+        (534, 530, "differs"),
+        (8, 7, "differs"),
+        (8, 8, "same"),
+        (0.034, 0.0341, "differs"),
+        (0.034, 0.03401, "same"),
+    ],
+)
+def test_counts_of_many_may_differ_by_one(given: float, made: float, state: str) -> None:
+    assert _compare("verify/1", {"points": given}, {"points": made}, {}).state == state
 
 
 def test_pages_without_a_certificate_are_refused(
