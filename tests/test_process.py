@@ -4,8 +4,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.process import call_apart
+from slviewer.registration.open3d_loader import fit_normals, fpfh_features, point_cloud
 from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import PointSet
 
@@ -39,8 +41,10 @@ def process_ids() -> list[int]:
         return [int(each) for each in own.read().split()]
 
 
-def test_program_goes_on_beside_a_long_call_with_the_same_result() -> None:
-    points, gaps, ended = ball(20_000), list[float](), threading.Event()
+@contextmanager
+def ticking() -> Iterator[list[float]]:
+    """For how many seconds another thread stands still each time, during the block."""
+    gaps, ended = list[float](), threading.Event()
 
     def tick() -> None:
         """Measure for how long this thread stands still."""
@@ -51,10 +55,17 @@ def test_program_goes_on_beside_a_long_call_with_the_same_result() -> None:
 
     clock = threading.Thread(target=tick)
     clock.start()
-    reports = list[tuple[float, str]]()
-    made = mesh_on_thread(points, lambda *report: reports.append(report))
-    ended.set()
-    clock.join()
+    try:
+        yield gaps
+    finally:
+        ended.set()
+        clock.join()
+
+
+def test_program_goes_on_beside_a_long_call_with_the_same_result() -> None:
+    points, reports = ball(20_000), list[tuple[float, str]]()
+    with ticking() as gaps:
+        made = mesh_on_thread(points, lambda *report: reports.append(report))
     same = build_mesh(points, MeshingPlan())
     np.testing.assert_array_equal(made.mesh.faces, same.mesh.faces)
     np.testing.assert_allclose(made.mesh.vertices, same.mesh.vertices, atol=1e-6)
@@ -62,6 +73,15 @@ def test_program_goes_on_beside_a_long_call_with_the_same_result() -> None:
     assert stages == sorted(stages, reverse=True) and len(stages) >= 5 and reports[-1][0] == 1.0
     in_the_call = sum(stage == "meshing by poisson" for _, stage in reports)
     assert in_the_call > 2 and max(gaps) < 0.5  # 1.5 s with the lock held
+
+
+def test_program_goes_on_beside_normals_and_features() -> None:
+    cloud = point_cloud(ball(20_000).points)
+    with ticking() as gaps:
+        fit_normals(cloud, 30)
+        features = fpfh_features(cloud, 5.0, 100)
+    assert np.abs(np.sum(cloud.normals * ball(20_000).normals, axis=1)).min() > 0.999
+    assert features.data.shape == (33, 20_000) and max(gaps) < 0.5  # 3 s with the lock held
 
 
 def test_errors_of_the_call_arrive_as_they_are() -> None:

@@ -107,6 +107,31 @@ def point_cloud(points: Floats, normals: Floats | None = None) -> Any:
     return cloud
 
 
+def fit_normals(cloud: Any, neighbours: int) -> None:
+    """Fit the unit normals of Open3D's cloud to so many ``neighbours``, towards those it has.
+
+    By the tensor API, here and in `fpfh_features`: the other one computes the same, but no thread
+    of the program runs meanwhile.
+    """
+    tensors = _to_tensors(cloud)
+    tensors.estimate_normals(neighbours)
+    cloud.normals = open3d().utility.Vector3dVector(tensors.point.normals.numpy())
+
+
+def fpfh_features(cloud: Any, radius: float, most: int) -> Any:
+    """Return the FPFH features of Open3D's cloud with normals, of at most so many neighbours within
+    ``radius`` mm."""
+    pipelines = open3d().t.pipelines.registration
+    features = open3d().pipelines.registration.Feature()
+    features.data = pipelines.compute_fpfh_feature(_to_tensors(cloud), most, radius).numpy().T
+    return features
+
+
+def _to_tensors(cloud: Any) -> Any:
+    """Return Open3D's cloud as one of its tensor API."""
+    return open3d().t.geometry.PointCloud.from_legacy(cloud, open3d().core.Dtype.Float64)
+
+
 def raycasting_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
     """Return Open3D's ray-casting scene of the triangles ``faces`` (m, 3) of vertices (n, 3)."""
     scene, tensor = open3d().t.geometry.RaycastingScene(), open3d().core.Tensor

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import lengths, median_spacing, thin_out
-from slviewer.registration.open3d_loader import open3d, point_cloud
+from slviewer.registration.open3d_loader import fit_normals, fpfh_features, open3d, point_cloud
 
 LEAST_POINTS = 500
 FINEST = 1 / 200
@@ -99,19 +99,14 @@ class PreparedScan:
     def smooth(self) -> tuple[Floats, Floats]:
         """Points (k, 3) mm, thinned to an eightieth of the size, and normals (k, 3) fitted to some
         thirty of them, which show the shape and not the noise; towards either side."""
-        geometry = open3d().geometry
-        cloud = geometry.PointCloud(self.thinned(self.size / 80.0).points)
-        cloud.estimate_normals(geometry.KDTreeSearchParamKNN(30))
+        cloud = open3d().geometry.PointCloud(self.thinned(self.size / 80.0).points)
+        fit_normals(cloud, 30)
         return np.asarray(cloud.points), np.asarray(cloud.normals)
 
     def features(self, voxel: float) -> Any:
         """Return Open3D's FPFH features of the cloud thinned to ``voxel`` mm; cached."""
         if voxel not in self._features:
-            o3d = open3d()
-            search = o3d.geometry.KDTreeSearchParamHybrid(5.0 * voxel, 100)
-            self._features[voxel] = o3d.pipelines.registration.compute_fpfh_feature(
-                self.thinned(voxel), search
-            )
+            self._features[voxel] = fpfh_features(self.thinned(voxel), 5.0 * voxel, 100)
         return self._features[voxel]
 
     def thinned(self, voxel: float) -> Any:
@@ -188,7 +183,7 @@ def _make_cloud(points: Floats, normals: np.ndarray | None, voxel: float, has_ca
     finite = None if normals is None else np.nan_to_num(np.asarray(normals, dtype=np.float64))
     cloud = point_cloud(points, finite).voxel_down_sample(voxel)
     if normals is None:
-        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
+        fit_normals(cloud, 30)
         cloud.orient_normals_towards_camera_location(np.zeros(3))
     else:
         known = lengths(np.asarray(cloud.normals)) > 0.1

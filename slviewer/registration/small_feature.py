@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.geometry.rigid import Floats, Uncertainty, move_points, turn_about
 from slviewer.geometry.vectors import lengths, occupied_cubes, subsample, unit_vectors
-from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.open3d_loader import fit_normals, open3d
 from slviewer.registration.refine import LooseMotions, RefinedPose, refine_pose
 from slviewer.registration.scan import PreparedScan
 from slviewer.registration.start import pose_distance
@@ -50,7 +50,7 @@ class _Surface:
 
     def __init__(self, scan: PreparedScan) -> None:
         cloud = open3d().geometry.PointCloud(scan.fine)
-        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(_OF_NORMALS))
+        fit_normals(cloud, _OF_NORMALS)
         self.points, self.tree = scan.fine_points, scan.fine_tree
         self.normals = np.asarray(cloud.normals)
 

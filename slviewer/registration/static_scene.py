@@ -18,7 +18,7 @@ from slviewer.geometry.rigid import Floats, Mask, move_points
 from slviewer.geometry.vectors import lengths
 from slviewer.reconstruction.cloud import Cloud, Points, choose_pixels, keep_pixels
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
-from slviewer.registration.open3d_loader import open3d, point_cloud
+from slviewer.registration.open3d_loader import fit_normals, point_cloud
 from slviewer.registration.pairwise import Progress
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import LEAST_POINTS, measure_size
@@ -254,7 +254,7 @@ def sample_surface(points: Points) -> SurfaceSamples:
     cloud = point_cloud(points).voxel_down_sample(measure_size(points) / _SAMPLES_PER_SIDE)
     # neighbours beside each other in memory halve the time of searches
     cloud = cloud.select_by_index(cKDTree(np.asarray(cloud.points)).indices)
-    cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
+    fit_normals(cloud, _NORMAL_POINTS)
     cloud.orient_normals_towards_camera_location(np.zeros(3))
     samples, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
     facing = -np.sum(samples * normals, axis=1) > _MIN_COSINE * lengths(samples)

@@ -10,7 +10,7 @@ from slviewer.geometry.rigid import Floats, move_points
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import diagonal, finite_rows, median_spacing, subsample
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.registration.open3d_loader import open3d, point_cloud
+from slviewer.registration.open3d_loader import fit_normals, point_cloud
 from slviewer.surface.overlap_kernels import MIN_NORMAL_COSINE
 from slviewer.surface.shapes import PointSet
 
@@ -46,9 +46,8 @@ def estimate_normals(points: Floats, sensor: Floats | None) -> tuple[Floats, boo
     """Estimate unit normals (n, 3) of points (n, 3) mm, and whether they are turned towards the
     ``sensor`` (3,): where that is unknown, or does not see most of them, neighbours are turned
     alike, and all outwards on the whole."""
-    search = open3d().geometry.KDTreeSearchParamKNN(_NEIGHBOURS)
     cloud = point_cloud(points)
-    cloud.estimate_normals(search)
+    fit_normals(cloud, _NEIGHBOURS)
     size = diagonal(points)
     thin = point_cloud(points).voxel_down_sample(size / _ORIENTED)
     if sensor is not None:
@@ -58,7 +57,7 @@ def estimate_normals(points: Floats, sensor: Floats | None) -> tuple[Floats, boo
         if len(visible) > _SEEN * len(thin.points):
             cloud.orient_normals_towards_camera_location(sensor)
             return np.asarray(cloud.normals), True
-    thin.estimate_normals(search)
+    fit_normals(thin, _NEIGHBOURS)
     thin.orient_normals_consistent_tangent_plane(12)
     places, facing = np.asarray(thin.points), np.asarray(thin.normals)
     if np.sum(facing * (places - places.mean(axis=0))) < 0:
