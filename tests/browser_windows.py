@@ -253,10 +253,15 @@ class WebKitWindow(Window):
 
 @contextmanager
 def _running(command: Sequence[str | Path], log: Path, **variables: str) -> Iterator[None]:
-    """Run a program with environment variables until the end, and then whatever it started."""
+    """Run a program with environment variables until the end, and then whatever it started; it ends
+    with this one too where that is killed."""
     with log.open("wb") as out:
         process = subprocess.Popen(
-            command, env={**os.environ, **variables}, stdout=out, stderr=out, start_new_session=True
+            ["setpriv", "--pdeathsig", "KILL", *command],
+            env={**os.environ, **variables},
+            stdout=out,
+            stderr=out,
+            start_new_session=True,
         )
     try:
         yield

@@ -213,7 +213,7 @@ const showNotice = (text) => {
     target ??= document.querySelector(input);
     for (let tries = 300; !target?.isConnected; target = document.querySelector(input)) {
       // looked for last, and for 30 s: the page may be drawing it anew; one that only watches has none
-      if (!tries--) return;
+      if (!tries--) throw Error("this page only watches");
       await new Promise((done) => setTimeout(done, 100));
     }
     target.files = given.files;
@@ -221,14 +221,25 @@ const showNotice = (text) => {
     target.dispatchEvent(new Event("change", { bubbles: true }));
     isHanding = false;
   };
-  addEventListener("drop", async (event) => {
+  // Says why what is done with files failed: none may be left unread in silence.
+  const attempt = async (act) => {
+    try {
+      await act();
+    } catch (error) {
+      showNotice(`The files could not be read: ${error.message}. Nothing was imported; see that they still exist and may be read.`);
+      setTimeout(showNotice, 15000);
+    }
+  };
+  addEventListener("drop", (event) => {
     const given = [...event.dataTransfer.items].map((item) => [item.webkitGetAsEntry(), item.getAsFile()]);
     const dropped = given.filter(([entry, own]) => entry ?? own);
     if (!dropped.length) return;
     event.preventDefault();
     showNotice("Listing the files …");
-    const listed = await Promise.all(dropped.map((each) => list(...each)));
-    await hand((dropped[0][0] ?? dropped[0][1]).name, listed.flat());
+    attempt(async () => {
+      const listed = await Promise.all(dropped.map((each) => list(...each)));
+      await hand((dropped[0][0] ?? dropped[0][1]).name, listed.flat());
+    });
   });
   // Its dialog takes several files, or a folder, as a drop does.
   addEventListener("click", ({ target }) => {
@@ -241,6 +252,6 @@ const showNotice = (text) => {
     if (isHanding || !target.matches?.(input) || !target.files.length) return;
     event.stopImmediatePropagation();
     const files = [...target.files].map((file) => ({ path: file.webkitRelativePath || file.name, file }));
-    hand(files[0].path.split("/")[0], files, target);
+    attempt(() => hand(files[0].path.split("/")[0], files, target));
   }, true);
 })();

@@ -100,3 +100,16 @@ def test_dropped_folder_and_clouds_are_imported(
     drop(page, folder.with_name("pose_ä"))
     assert operator.wait_for(lambda s: len(s.content.poses) == 2, PATIENCE_S)
     assert opened.errors == []
+
+
+def test_files_that_cannot_be_read_are_said_to(opened: Opened, tmp_path: Path) -> None:
+    page = opened.page
+    make_files(tmp_path)
+    expect(button(page, "Import files")).to_be_visible()
+    page.evaluate("() => { Blob.prototype.stream = () => { throw Error('gone since') } }")
+    drop(page, tmp_path / "first.xyz", tmp_path / "second.xyz")
+    said = page.get_by_text("The files could not be read: gone since. Nothing was imported")
+    expect(said).to_be_visible()
+    expect(said).to_be_hidden()  # after some seconds
+    choose_files(page, "Import files", tmp_path / "first.xyz", tmp_path / "second.xyz")
+    expect(said).to_be_visible()
