@@ -7,6 +7,19 @@
 const buttonHints = new Map();
 // Colours of the lines of the floor, in the light and in the dark theme.
 const FLOOR = { false: [[225, 229, 233], [190, 196, 202]], true: [[42, 45, 48], [62, 66, 70]] };
+// Until the wizard is drawn, the client would show a panel of its own, for seconds on a slow machine; where none comes, that
+// says why. Views of scripts have no path, and no line of state.
+if (location.pathname.length > 1) {
+  const { dataset } = document.documentElement;
+  const show = () => {
+    delete dataset.starting;
+    watcher.disconnect();
+  };
+  const watcher = new MutationObserver(() => document.querySelector("[data-activity]") && show());
+  watcher.observe(document, { childList: true, subtree: true });
+  dataset.starting = "";
+  setTimeout(show, 20000);
+}
 (() => {
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const onmessage = Object.getOwnPropertyDescriptor(Worker.prototype, "onmessage");

@@ -59,6 +59,21 @@ def opened(shared_page: Opened) -> Opened:
     return shared_page
 
 
+SEES_VISER = """new MutationObserver(() => {
+  window.seen ||= document.body?.innerText.includes("Dev Settings");
+}).observe(document, { childList: true, subtree: true, attributes: true })"""
+"""Whether the panel that viser's client shows on its own was ever seen."""
+
+
+def test_no_panel_of_visers_own_is_seen_while_the_page_starts(browser: Browser, app: App) -> None:
+    page = new_page(browser)
+    page.add_init_script(SEES_VISER)
+    page.goto(app.server.link(), wait_until="commit")
+    expect(button(page, "1. Rig")).to_be_visible()
+    assert not page.evaluate("window.seen")
+    page.context.close()
+
+
 @pytest.fixture(scope="module")
 def shared_guest(browser: Browser, app: App) -> Iterator[Opened]:
     page = new_page(browser)
@@ -106,6 +121,8 @@ def test_view_keeps_most_of_the_page_in_the_theme_of_the_system(opened: Opened) 
 def test_live_image_is_enlarged_by_click_and_by_key(opened: Opened) -> None:
     page = opened.page
     click(page, "1. Rig")
+    # the step of before goes a moment later, and its own live image with it
+    expect(page.get_by_text("Choose your board, or print one")).to_be_hidden()
     image = button(page, "Camera image")
     image.wait_for()
 
