@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from slviewer import __version__
 from slviewer.calibration.camera import CameraCalibration, calibrate_camera
@@ -442,14 +443,16 @@ def _diagnose_poses(
         judged.append(pose)
         progress(len(judged) / count, f"read {pose.name}")
     refused = {pose.name: pose.refused for pose in judged if pose.observation is None}
-    result = calibrate_with_diagnosis(
-        [pose.observation for pose in judged if pose.observation is not None],
-        [pose.evidence for pose in judged if pose.evidence is not None],
-        other_size,
-        board,
-        {**excluded, **refused},
-        camera,
-    )
+    # its matrices are narrow: more threads gain nothing, and occupy the cores while they wait
+    with threadpool_limits(1, user_api="blas"):
+        result = calibrate_with_diagnosis(
+            [pose.observation for pose in judged if pose.observation is not None],
+            [pose.evidence for pose in judged if pose.evidence is not None],
+            other_size,
+            board,
+            {**excluded, **refused},
+            camera,
+        )
     if result.stereo is None:
         return result
     return replace(result, stereo=replace(result.stereo, excluded=result.excluded))
@@ -487,7 +490,10 @@ def _fit_models(
             others = [each for each in verdict.findings if each is not few]
             verdict = Verdict.of([more, *others])
         else:
-            with _warn_of_failure("pixel-wise", models, warn):
+            with (
+                _warn_of_failure("pixel-wise", models, warn),
+                threadpool_limits(1, user_api="blas"),  # as for the diagnosis
+            ):
                 fitting = stage(progress, 0.0, share, "pixel-wise fit")
                 pixelwise = calibrate_pixelwise(observations, stereo, fitting)
     if "splined" in models:
