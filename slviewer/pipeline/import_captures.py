@@ -430,22 +430,25 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
     sequence, phases = _decode_described(replace(capture, sequence=sequence), warn)
     warn_of_exposure(capture.name, sequence, frames, phases, warn)
     for axis, decoded in phases.items():
-        if _falls(sequence, decoded):
-            other = f"or phase_sign is {-sequence.sign(axis)}, which fringes alone do not show"
+        if other := _explain_fall(sequence, decoded):
             warn(f"{capture.name}: {describe_reversal(axis, 'the coordinate falls', other)}")
         if rounded := find_rounded_periods(sequence, frames, decoded):
             sequence = _take_periods(capture.name, sequence, axis, rounded, warn)
     return replace(capture, sequence=sequence)
 
 
-def _falls(sequence: PatternSequence, decoded: PhaseMap) -> bool:
-    """Return whether the coordinate of fringes without a code falls along its own axis of the
-    camera. A code would contradict another sign of the phase, and the other axis a single one."""
-    if sequence.find("gray", decoded.axis):
-        return False
-    along = "yx".index(decoded.axis)
-    own, other = (np.nanmedian(np.diff(decoded.phase, axis=i)) for i in (along, 1 - along))
-    return bool(own < -abs(other))
+def _explain_fall(sequence: PatternSequence, decoded: PhaseMap) -> str:
+    """Return what else makes the coordinate of fringes or of a binary code alone fall along its own
+    axis of the camera than a turned device; empty where it does not fall, or the frames tell."""
+    axis = decoded.axis
+    other = f"or phase_sign is {-sequence.sign(axis)}, which fringes alone do not show"
+    if sequence.find("gray", axis):
+        if decoded.steps or not (sequence.binary and sequence.find("inverse", axis)):
+            return ""
+        other = "or patterns and inverses are exchanged, which a binary code alone does not show"
+    along = "yx".index(axis)
+    own, across = (np.nanmean(np.diff(decoded.phase, axis=i)) for i in (along, 1 - along))
+    return other if own < -abs(across) else ""
 
 
 def _decode_described(capture: NewCapture, warn: Warn) -> tuple[PatternSequence, PhaseMaps]:
