@@ -8,9 +8,10 @@ import numpy as np
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
 
-DECIMALS = range(2, 5)
-"""Of periods that may be rounded: with one decimal half of all periods are near a whole number of
-fringes by chance, and more than four leave no error that matters."""
+DECIMALS = range(1, 5)
+"""Of periods that may be rounded: more leave no error that matters."""
+FEW_DECIMALS = 1
+"""With so few, a third of all periods are near a whole number of fringes by chance."""
 _BINS = 20
 _SIGNIFICANT = 3.0
 """Standard errors."""
@@ -18,21 +19,27 @@ _SIGNIFICANT = 3.0
 
 @dataclass(frozen=True)
 class RoundedPeriods:
-    """The ``exact`` period, px, of each described one of an axis, of ``fringes`` across the
-    projector; ``fit``: 0 where the frames fit the described ones, 1 where they fit the exact ones,
-    with its standard error ``sigma``, infinite where they do not show it."""
+    """The ``exact`` period, px, of each described one of an axis of ``extent`` px; ``fit``: 0 where
+    the frames fit the described ones, 1 where they fit the exact ones, with its standard error
+    ``sigma``, infinite where they do not show it."""
 
     exact: dict[float, float]
-    fringes: tuple[int, ...]
+    extent: int
     fit: float
     sigma: float
 
     @property
+    def fringes(self) -> tuple[int, ...]:
+        """The number of fringes of each exact period across the projector."""
+        return tuple(round(self.extent / exact) for exact in self.exact.values())
+
+    @property
     def is_taken(self) -> bool:
         """Whether the exact periods are right: several round to the described ones, which is no
-        chance, and the frames do not contradict it; or they show it of one."""
-        is_shown = self.sigma < 0.5 / _SIGNIFICANT
-        return self.fit > 0.5 if is_shown else len(self.exact) > 1
+        chance, and the frames do not contradict it; or they show it."""
+        if self.sigma < 0.5 / _SIGNIFICANT:
+            return self.fit > 0.5
+        return len(self.exact) > 1 and max(map(count_decimals, self.exact)) > FEW_DECIMALS
 
     @property
     def is_contradicted(self) -> bool:
@@ -49,23 +56,36 @@ def find_rounded_periods(
 
     Periods that are scaled unlike each other disagree the more, the farther from the first fringe.
     """
-    if sequence.projector_size is None:
-        return None
-    axis, exact, fringes = decoded.axis, dict[float, float](), list[int]()
-    for period in sequence.periods_px(axis):
-        count = max(1, round(sequence.extent(axis) / period))
-        whole = sequence.extent(axis) / count
-        places = len(f"{period:.6f}".rstrip("0").partition(".")[2])
-        if abs(whole - period) < 1e-6 * period or not places:
-            continue
-        if places not in DECIMALS or abs(whole - period) > 0.501 * 10**-places:
-            return None
-        exact[period] = whole
-        fringes.append(count)
+    exact = list_exact_periods(sequence, decoded.axis)
     if not exact:
         return None
     fit, sigma = _fit_scale(sequence, frames, decoded, exact)
-    return RoundedPeriods(exact, tuple(fringes), fit, sigma)
+    return RoundedPeriods(exact, sequence.extent(decoded.axis), fit, sigma)
+
+
+def list_exact_periods(sequence: PatternSequence, axis: Axis) -> dict[float, float]:
+    """Return the periods of whole numbers of fringes across the projector, by those of an axis that
+    are rounded from them; empty where one that has decimals cannot be."""
+    if sequence.projector_size is None:
+        return {}
+    exact, periods, extent = dict[float, float](), sequence.periods_px(axis), sequence.extent(axis)
+    # one of two decimals may end in 0
+    places = {period: count_decimals(period) for period in periods}
+    most = max(places.values(), default=0)
+    for period in periods:
+        whole = extent / max(1, round(extent / period))
+        if abs(whole - period) < 1e-6 * period:
+            continue
+        if most in DECIMALS and abs(whole - period) <= 0.501 * 10**-most:
+            exact[period] = whole
+        elif places[period]:
+            return {}
+    return exact
+
+
+def count_decimals(period_px: float) -> int:
+    """Return the number of decimals of a period, of six at most."""
+    return len(f"{period_px:.6f}".rstrip("0").partition(".")[2])
 
 
 def replace_periods(

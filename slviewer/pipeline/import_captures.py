@@ -21,11 +21,12 @@ from slviewer.errors import InputError, UnknownLayoutError
 from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
-from slviewer.fringe.phase import Reason
+from slviewer.fringe.phase import PhaseMap, PhaseMaps, Reason
 from slviewer.fringe.raw_image import describe_mosaic
 from slviewer.fringe.rounded_periods import (
     RoundedPeriods,
     find_rounded_periods,
+    list_exact_periods,
     replace_periods,
 )
 from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, Size, parse_size
@@ -48,6 +49,7 @@ from slviewer.pipeline.operation import (
 from slviewer.session.capture import NewCapture, Role
 from slviewer.session.importers import matlab_calibration, opencv_calibration
 from slviewer.session.importers.filestorage import Storage, read_storage
+from slviewer.session.importers.guess import describe_reversal
 from slviewer.session.importers.guessed_frames import guess_description
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
@@ -425,12 +427,52 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
                 )
     if mosaic := describe_mosaic(capture.name, frames):
         warn(mosaic)
-    phases = decode_examined(capture.name, sequence, frames, capture.files)
+    sequence, phases = _decode_described(replace(capture, sequence=sequence), warn)
     warn_of_exposure(capture.name, sequence, frames, phases, warn)
     for axis, decoded in phases.items():
+        if other := _explain_fall(sequence, decoded):
+            warn(f"{capture.name}: {describe_reversal(axis, 'the coordinate falls', other)}")
         if rounded := find_rounded_periods(sequence, frames, decoded):
             sequence = _take_periods(capture.name, sequence, axis, rounded, warn)
     return replace(capture, sequence=sequence)
+
+
+def _explain_fall(sequence: PatternSequence, decoded: PhaseMap) -> str:
+    """Return what else makes the coordinate of fringes or of a binary code alone fall along its own
+    axis of the camera than a turned device; empty where it does not fall, or the frames tell."""
+    axis = decoded.axis
+    other = f"or phase_sign is {-sequence.sign(axis)}, which fringes alone do not show"
+    if sequence.find("gray", axis):
+        if decoded.steps or not (sequence.binary and sequence.find("inverse", axis)):
+            return ""
+        other = "or patterns and inverses are exchanged, which a binary code alone does not show"
+    along = "yx".index(axis)
+    own, across = (np.nanmean(np.diff(decoded.phase, axis=i)) for i in (along, 1 - along))
+    return other if own < -abs(across) else ""
+
+
+def _decode_described(capture: NewCapture, warn: Warn) -> tuple[PatternSequence, PhaseMaps]:
+    """Return the sequence of a capture of one exposure, and its decoded phases. Where the frames
+    contradict it, and not one with the periods that its own are rounded from, these are taken: too
+    short beats, and periods of few decimals, look like other faults."""
+    name, sequence, messages = capture.name, capture.sequence, list[str]()
+    try:
+        return sequence, decode_examined(name, sequence, capture.frames, capture.files)
+    except InputError as error:
+        whole = sequence
+        for axis in sequence.axes:
+            if exact := list_exact_periods(sequence, axis):
+                rounded = RoundedPeriods(exact, sequence.extent(axis), fit=1.0, sigma=0.0)
+                whole = _take_periods(name, whole, axis, rounded, messages.append)
+        if not messages:
+            raise
+        try:
+            phases = decode_examined(name, whole, capture.frames, capture.files)
+        except InputError:
+            raise error from None
+    for message in messages:
+        warn(message)
+    return whole, phases
 
 
 def _take_periods(

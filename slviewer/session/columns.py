@@ -18,6 +18,7 @@ _SPELLINGS = {
     COLOURS: (
         "red green blue",
         "r g b",
+        "rf gf bf",
         "diffusered diffusegreen diffuseblue",
         "colorred colorgreen colorblue",
     ),

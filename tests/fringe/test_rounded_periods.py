@@ -54,22 +54,53 @@ def test_periods_that_are_what_they_state_stay() -> None:
         assert find_rounded_periods(sequence, frames, decode(sequence, frames, "x")) is None
 
 
-def test_import_takes_whole_fringes_and_says_so(tmp_path: Path) -> None:
-    _, frames, _ = make_frames(EXACT, ROUNDED)
-    (tmp_path / "scan").mkdir()
+def import_periods(folder: Path, periods: dict[str, list], frames: np.ndarray) -> dict[str, tuple]:
+    """Import frames described with each of the periods, by name; return the sequences and the
+    warnings."""
+    (folder / "scan").mkdir()
     for i, image in enumerate(frames):
-        cv2.imwrite(str(tmp_path / "scan" / f"{i:02d}.png"), image)
+        cv2.imwrite(str(folder / "scan" / f"{i:02d}.png"), image)
     head = 'projector = "912x1140"\norder = "name"\n'
     head += '[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 4\n'
-    periods = {"rounded": [*ROUNDED], "exact": ["912/70", 14.25, "912/59"]}
+    found = {}
     for name, period_px in periods.items():
-        (tmp_path / f"{name}.toml").write_text(f"{head}period_px = {period_px}\n")
+        (folder / f"{name}.toml").write_text(f"{head}period_px = {period_px}\n")
         warnings = list[str]()
         import_captures(
-            tmp_path / "scan", tmp_path / name, "frames", role="scan",
-            sequence=tmp_path / f"{name}.toml", warn=warnings.append,
+            folder / "scan", folder / name, "frames", role="scan",
+            sequence=folder / f"{name}.toml", warn=warnings.append,
         )  # fmt: skip
-        sequence = Session.open(tmp_path / name).load_capture("scan").sequence
+        sequence = Session.open(folder / name).load_capture("scan").sequence
+        found[name] = sequence, " ".join(warnings)
+    return found
+
+
+def test_import_takes_whole_fringes_and_says_so(tmp_path: Path) -> None:
+    _, frames, _ = make_frames(EXACT, ROUNDED)
+    periods = {"rounded": [*ROUNDED], "exact": ["912/70", 14.25, "912/59"]}
+    for name, (sequence, said) in import_periods(tmp_path, periods, frames).items():
         assert sequence.periods_px("x") == EXACT[::-1]
-        said = " ".join(warnings)
         assert bool(missing_facts(said, "59 and 70 fringes", '"912/70"')) == (name == "exact")
+
+
+@pytest.mark.parametrize(
+    ("counts", "stated"), [((73, 72, 64), [12.49, 12.67, 14.25]), ((94, 93, 80), [9.7, 9.81, 11.4])]
+)
+def test_rounded_beats_of_the_projectors_length(
+    tmp_path: Path, counts: tuple[int, ...], stated: list[float]
+) -> None:
+    """Rounding makes the beat shorter than the projector; 9.7 is 9.70, of two decimals."""
+    exact = tuple(912 / count for count in counts)
+    _, frames, _ = make_frames(exact, exact)
+    ((sequence, said),) = import_periods(tmp_path, {"rounded": stated}, frames).values()
+    assert sequence.periods_px("x") == exact[::-1]
+    assert not missing_facts(said, f'"912/{counts[0]}"')
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_fringes_of_another_sign_are_mentioned(tmp_path: Path, sign: int) -> None:
+    """Fringes alone do not show whether their steps run backwards, or the projector is upside
+    down."""
+    _, frames, _ = make_frames(EXACT, EXACT, sign)
+    ((_, said),) = import_periods(tmp_path, {"exact": ["912/70", 14.25, "912/59"]}, frames).values()
+    assert ("phase_sign is -1" in said) == (sign < 0)

@@ -16,7 +16,7 @@ from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray, gray_bits, phase_steps
 from slviewer.fringe.sequence import PatternSequence, PerAxis
 from slviewer.pipeline.capture_phases import decode_capture
-from slviewer.pipeline.import_captures import find_captures
+from slviewer.pipeline.import_captures import find_captures, import_captures
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,
@@ -363,3 +363,24 @@ def _toml(values: dict) -> str:
     return "\n".join(
         f'{k} = "{v}"' if isinstance(v, str) else f"{k} = {v}" for k, v in values.items()
     )
+
+
+@pytest.mark.parametrize("is_exchanged", [False, True])
+def test_exchanged_inverses_of_a_binary_code_are_mentioned(
+    tmp_path: Path, is_exchanged: bool
+) -> None:
+    """The negative of a binary code numbers the columns from the other end."""
+    column = np.clip(np.linspace(5, 250, 400), 0, 255).astype(int)
+    for bit in range(8):
+        image = np.repeat(40 + 180 * ((column[None] >> (7 - bit)) & 1), 60, axis=0)
+        noise = np.random.default_rng(bit).normal(0, 1, image.shape)
+        for kind, levels in (("a", image), ("b", 260 - image)):
+            cv2.imwrite(str(tmp_path / f"{kind}{bit}.png"), np.rint(levels + noise))
+    toml = 'projector = "256x200"\ncode = "binary"\ngray_origin = -0.5\n'
+    kinds = ("inverse", "gray") if is_exchanged else ("gray", "inverse")
+    for files, kind in zip("ab", kinds, strict=True):
+        toml += f'[[frames]]\nkind = "{kind}"\naxis = "x"\nbits = 8\nfiles = "{files}*.png"\n'
+    (tmp_path / "frames.toml").write_text(toml)
+    warnings = list[str]()
+    import_captures(tmp_path, tmp_path / "session", "frames", role="scan", warn=warnings.append)
+    assert ("inverses are exchanged" in " ".join(warnings)) == is_exchanged

@@ -18,6 +18,7 @@ from tests.proofs.accuracy import prove_accuracy, prove_uncertainty
 from tests.proofs.cameras import prove_cameras
 from tests.proofs.captures import prove_captures, prove_pipelines
 from tests.proofs.causes import prove_causes
+from tests.proofs.codes import prove_codes
 from tests.proofs.cut_boards import prove_cut_boards
 from tests.proofs.files import prove_files
 from tests.proofs.guidance import prove_guidance
@@ -77,6 +78,7 @@ CLAIMS: Mapping[str, tuple[str, Callable[..., Proof]]] = {
     "boards": ("boards cut by border, light or hand", prove_cut_boards),
     "cameras": ("two cameras", prove_cameras),
     "causes": ("faults called by their names", prove_named_faults),
+    "codes": ("folders of frames decoded, or what is wrong named", prove_codes),
     "edges": ("printed edges without ridges", prove_edges),
     "files": ("files of other programs", prove_files),
     "guidance": ("guided poses", prove_guidance),

@@ -42,7 +42,7 @@ DRAWS: Mapping[str, tuple[Draw, int]] = {
     "pcd": (clouds.draw_pcd, 60),
     "obj": (clouds.draw_obj, 30),
     "stl": (clouds.draw_stl, 20),
-    "e57": (clouds.draw_e57, 10),
+    "e57": (clouds.draw_e57, 40),
     "off": (clouds.draw_off, 30),
     "mat": (clouds.draw_mat, 30),
     "las": (clouds.draw_las, 30),

@@ -54,6 +54,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
         "boards": True,
         "cameras": True,
         "causes": False,
+        "codes": True,
         "edges": True,
         "files": True,
         "guidance": True,

@@ -163,6 +163,61 @@ def test_points_far_from_each_other_are_refused(tmp_path: Path) -> None:
         read_cloud(tmp_path / "a.xyz")
 
 
+def mark(number: float, style: str) -> str:
+    """Write a number with marks between thousands, or with a decimal comma, in quotes."""
+    text = f"{number:,.3f}"
+    if style == "1.234,5":
+        return text.translate(str.maketrans(",.", ".,"))
+    return f'"{text}"' if style == '"1,234.5"' else f'"{number:.3f}"'.replace(".", ",")
+
+
+@pytest.mark.parametrize(
+    ("style", "separator"), [('"1,234.5"', ","), ("1.234,5", ";"), ('"1234,5"', ",")]
+)
+def test_numbers_of_other_countries_are_read(tmp_path: Path, style: str, separator: str) -> None:
+    """Quoted cells hold separators, as this name of a column does."""
+    points = np.round(100 * POINTS, 3)
+    lines = [separator.join(['"Distance, mm"', "x", "y", "z"])]
+    lines += [separator.join(["1.5", *(mark(each, style) for each in row)]) for row in points]
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    cloud = read(tmp_path / "a.csv")
+    assert np.allclose(cloud.points, points) and any("numbers" in note for note in cloud.notes)
+
+
+@pytest.mark.parametrize("words", [("nan(ind)", "-1.#IND"), ("1.#QNAN", "-nan(ind)")])
+def test_numbers_that_windows_calls_none_are_dropped(tmp_path: Path, words: tuple) -> None:
+    lines = [f"{x:.3f} {y:.3f} {z:.3f}" for x, y, z in POINTS]
+    (tmp_path / "a.xyz").write_text("\n".join([*lines, *(f"1 2 {word}" for word in words)]))
+    assert len(read(tmp_path / "a.xyz").points) == len(POINTS)
+
+
+def test_negative_columns_behind_a_comma_are_no_thousands(tmp_path: Path) -> None:
+    text = "\n".join(f"{x:.3f},{y:.3f},{z:.3f},{i}" for i, (x, y, z) in enumerate(-abs(POINTS)))
+    (tmp_path / "a.csv").write_text(text)
+    assert np.allclose(read(tmp_path / "a.csv").points, -abs(POINTS), atol=1e-3)
+
+
+def test_normals_of_zeros_are_estimated(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", POINTS, None, np.zeros_like(POINTS))
+    cloud = read(tmp_path / "a.ply")
+    assert cloud.normals is None and "normals" in " ".join(cloud.notes)
+
+
+def test_pcd_of_old_versions_states_no_number_of_points(tmp_path: Path) -> None:
+    write_pcd(tmp_path / "a.pcd", False)
+    lines = (tmp_path / "a.pcd").read_bytes().split(b"\n")
+    old = [line for line in lines if not line.startswith(b"POINTS")]
+    (tmp_path / "a.pcd").write_bytes(b"\n".join(old))
+    assert len(read(tmp_path / "a.pcd").points) == len(POINTS)
+
+
+def test_points_beside_a_mesh_are_counted(tmp_path: Path) -> None:
+    box = trimesh.creation.box((60, 40, 20))
+    box.vertices = np.vstack([box.vertices, [[1, 2, 3], [4, 5, 6]]])
+    box.export(tmp_path / "a.off")
+    assert "2 of 10 points" in " ".join(read(tmp_path / "a.off").notes)
+
+
 SCALARS = {"temperature": RNG.normal(20, 1, 300), "time": 1.7e9 + RNG.uniform(size=300)}
 
 

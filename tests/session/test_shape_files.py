@@ -24,6 +24,7 @@ from slviewer.session.shape_files import (
     write_shape,
 )
 from slviewer.surface.shapes import Mesh, PointSet
+from tests.proofs.file_variants.clouds import write_e57
 
 RNG = np.random.default_rng(7)
 NOTES = ("calibration: splined", "frame: the camera's")
@@ -142,6 +143,21 @@ def test_e57_keeps_the_normals_of_the_points(tmp_path: Path) -> None:
     assert cloud.normals is not None
     near(cloud.normals, POINTS.normals, 1e-5)
     near(cloud.points, POINTS.points, 1e-4)
+
+
+@pytest.mark.parametrize(("top", "has_limits"), [(1, False), (1023, False), (65535, True)])
+def test_colours_of_an_e57_are_read_by_its_limits(
+    tmp_path: Path, top: int, has_limits: bool
+) -> None:
+    """Dark colours of 10 or 16 bits look like those of 8 bits, and fractions are no levels."""
+    levels = np.rint(POINTS.points[:, 0] - POINTS.points[:, 0].min()) % 100
+    kind = "float" if top == 1 else f"int {top}"
+    fields = [(f"cartesian{axis}", "double", POINTS.points[:, i]) for i, axis in enumerate("XYZ")]
+    fields += [(f"color{name}", kind, levels * top / 255) for name in ("Red", "Green", "Blue")]
+    (tmp_path / "a.e57").write_bytes(write_e57(fields, limits=top if has_limits else 0))
+    _, (cloud,) = read_cloud(tmp_path / "a.e57")
+    assert cloud.colours is not None
+    near(cloud.colours[:, 0], levels, 1)
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])

@@ -23,9 +23,7 @@ _NORMAL = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 """The extension of the standard that names normals."""
 _LARGEST = float(np.finfo(np.float32).max)
-_POLAR = {"sphericalRange", "sphericalAzimuth", "sphericalElevation"}
-_STATES = {"cartesianInvalidState", "isColorInvalid"}
-"""Fields by which pye57 leaves points out."""
+_POLAR = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 
 def _require_package(path: Path) -> None:
@@ -103,13 +101,11 @@ def _set_limits(
     scan.set(name, node)
 
 
-def _read_others(file: Any, header: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return fields of a scan that pye57 does not read, of the points that are valid; normals in
-    the file's frame."""
+def _read_fields(file: Any, header: Any, notes: list[str]) -> dict[str, np.ndarray]:
+    """Return all fields of a scan, of the points that no state calls invalid, as float64."""
     from pye57 import libe57
 
-    states = [each for each in header.point_fields if each.endswith("InvalidState")]
-    arrays = {name: np.empty(header.point_count) for name in (*names, *states)}
+    arrays = {name: np.empty(header.point_count) for name in header.point_fields}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in arrays.items():
         buffers.append(
@@ -117,15 +113,60 @@ def _read_others(file: Any, header: Any, names: Sequence[str]) -> dict[str, np.n
         )
     header.points.reader(buffers).read()
     valid = np.ones(header.point_count, bool)
-    for state in states:
+    for state in [name for name in arrays if name.endswith("InvalidState")]:
         valid &= arrays.pop(state) == 0
-    arrays = {name.rpartition(":")[2]: values[valid] for name, values in arrays.items()}
-    if header.has_pose() and set(_NORMAL) <= set(names):
-        axes = [name.rpartition(":")[2] for name in _NORMAL]
-        normals = np.stack([arrays[axis] for axis in axes], axis=1)
-        normals = file.to_global(normals, header.rotation, np.zeros(3))
-        arrays |= dict(zip(axes, normals.T, strict=True))
-    return arrays
+    if invalid := np.count_nonzero(~valid):
+        notes.append(f"{invalid:,} of {len(valid):,} points are marked as invalid, and dropped")
+    return {name: values[valid] for name, values in arrays.items()}
+
+
+def _place_fields(file: Any, header: Any, fields: dict[str, np.ndarray]) -> None:
+    """Replace places and normals, in place, by those in the file's frame, in which the header
+    states the scanner's place; places by angles and distance become x y z."""
+    from pye57.utils import convert_spherical_to_cartesian
+
+    if _POLAR[0] in fields:
+        polar = np.stack([fields.pop(name) for name in _POLAR], axis=1)
+        if _PLACE[0] not in fields:
+            fields |= dict(zip(_PLACE, convert_spherical_to_cartesian(polar).T, strict=True))
+    if not header.has_pose():
+        return
+    for names, shift in ((_PLACE, header.translation), (_NORMAL, np.zeros(3))):
+        if set(names) <= fields.keys():
+            values = np.stack([fields[name] for name in names], axis=1)
+            placed = file.to_global(values, header.rotation, shift)
+            fields |= dict(zip(names, placed.T, strict=True))
+
+
+def _scale_colours(header: Any, fields: dict[str, np.ndarray], notes: list[str]) -> None:
+    """Replace colours, in place, by levels of 8 bits: by the limits that the scan states, else
+    those of the field's whole numbers. Values outside of these stay as they are."""
+    if not set(_COLOURS) <= fields.keys():
+        return
+    values = np.stack([fields[name] for name in _COLOURS], axis=1)
+    low, high = np.array([_find_limits(header, name) for name in _COLOURS]).T
+    if not (low < high).all() or not ((low <= values) & (values <= high)).all():
+        return
+    levels = np.rint(255 * (values - low) / (high - low)).astype(np.uint8)
+    fields |= dict(zip(_COLOURS, levels.T, strict=True))
+    if (count := (high - low).max() + 1) > 256:
+        notes.append(f"its colours of {count:.0f} levels were scaled to 8 bits")
+
+
+def _find_limits(header: Any, name: str) -> tuple[float, float]:
+    """Return the least and the largest value that a colour may have; (0, 0) where nothing says."""
+    from pye57 import libe57
+
+    if header.node.isDefined("colorLimits"):
+        limits = header.node["colorLimits"]
+        ends = [f"{name}{end}" for end in ("Minimum", "Maximum")]
+        if all(map(limits.isDefined, ends)):
+            low, high = (limits[end].value() for end in ends)
+            return low, high
+    number = libe57.StructureNode(header.points.prototype())[name]
+    if isinstance(number, libe57.IntegerNode):
+        return number.minimum(), number.maximum()
+    return 0, 0
 
 
 def _read(path: Path, data: bytes, notes: list[str]) -> list[Columns]:
@@ -137,11 +178,10 @@ def _read(path: Path, data: bytes, notes: list[str]) -> list[Columns]:
     try:
         for i in range(file.scan_count):
             header = file.get_header(i)
-            # transformed into the file's frame, in which the header states the scanner's place
-            values = file.read_scan(i, colors=True, transform=True, ignore_missing_fields=True)
-            used = values.keys() | _STATES | _POLAR
-            others = [name for name in header.point_fields if name not in used]
-            values |= _read_others(file, header, others) if others else {}
+            fields = _read_fields(file, header, notes)
+            _place_fields(file, header, fields)
+            _scale_colours(header, fields, notes)
+            values = {name.rpartition(":")[2]: each for name, each in fields.items()}
             scans.append(values | ({SENSOR: header.translation} if header.has_pose() else {}))
     finally:
         file.close()

@@ -4,6 +4,7 @@ compressed too."""
 
 import re
 from collections.abc import Sequence
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,8 @@ def _read(path: Path, data: bytes, notes: list[str]) -> list[Columns]:
         raise ValueError("it has no line DATA")
     rows = map(str.split, data[: match.start()].decode("ascii", "replace").splitlines())
     header = {words[0].upper(): words[1:] for words in rows if words}
-    count, form, body = int(header["POINTS"][0]), match[1].lower(), data[match.end() :]
+    size = header.get("POINTS") or [*header["WIDTH"], *header.get("HEIGHT", [])]
+    count, form, body = prod(map(int, size)), match[1].lower(), data[match.end() :]
     names = header.get("FIELDS") or header["COLUMNS"]
     repeats = header.get("COUNT", ["1"] * len(names))
     described = zip(names, header["TYPE"], header["SIZE"], repeats, strict=True)

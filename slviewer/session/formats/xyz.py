@@ -22,6 +22,13 @@ _SIZES = Sizes(0, 33, 12)
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(?i:nan|inf)")
 _COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+_QUOTED = re.compile(r'"([^"\n]*)"')
+_THOUSANDS = re.compile(
+    r"(?<![-+\d.,])([-+]?\d{1,3})((?:,\d{3})+(?=\.)|(?:\.\d{3})+(?=,))([.,]\d+)(?![\d.,])"
+)
+"""Numbers with marks between thousands: 1,234.5 or 1.234,5."""
+_NO_NUMBER = re.compile(r"[-+]?(?:1\.#[A-Z]+|(?i:nan)\(\w+\))")
+"""How programs on Windows write NaN and infinity."""
 _UNIT = re.compile(r"[\[(][^\])]+[\])]")
 _PTS = {4: ("intensity",), 6: COLOURS, 7: ("intensity", *COLOURS)}
 """Names of the columns behind x y z in a PTS, by the number of all."""
@@ -68,7 +75,8 @@ def _read_lines(name: str, data: bytes, notes: list[str]) -> _Lines:
     """Return the lines of a text that are not empty. Raises InputError without any of three
     numbers, and for blocks of other numbers of points than announced."""
     text = data.decode("utf-16" if data[:2] in _UTF16 else "utf-8-sig", "replace")
-    lines = [line for line in map(str.strip, text.replace('"', "").splitlines()) if line]
+    text = _settle_marks(_NO_NUMBER.sub("nan", text), notes)
+    lines = [line for line in map(str.strip, text.splitlines()) if line]
     first = next((i for i, line in enumerate(lines) if len(_number_places(line)) >= 3), None)
     if first is None:
         raise InputError(
@@ -84,6 +92,23 @@ def _read_lines(name: str, data: bytes, notes: list[str]) -> _Lines:
         notes.append("the commas in its numbers were read as decimal points")
         rows = [row.replace(",", ".") for row in rows]
     return _Lines(titles, rows, separator, has_counts)
+
+
+def _settle_marks(text: str, notes: list[str]) -> str:
+    """Return a text without marks between thousands and without quotes, in which no separator
+    lies."""
+    text, grouped = _THOUSANDS.subn(lambda m: m[1] + re.sub("[.,]", "", m[2]) + m[3], text)
+    if grouped:
+        notes.append("the marks between thousands in its numbers were left out")
+    cells = [cell for cell in _QUOTED.findall(text) if _COMMA.fullmatch(cell)]
+    if cells:
+        notes.append(f"the commas in its quoted numbers were read as decimal points: {cells[0]}")
+
+    def unquote(match: re.Match[str]) -> str:
+        """Return a quoted cell with a decimal point, or spaces in place of separators."""
+        return re.sub("[,;\t]", "." if _COMMA.fullmatch(match[1]) else " ", match[1])
+
+    return _QUOTED.sub(unquote, text).replace('"', "")
 
 
 def _split_line(line: str) -> tuple[str | None, list[str]]:

@@ -128,6 +128,9 @@ def _check_points(name: str, columns: Columns, unit: Units, about_file: Sequence
     if normals is not None:
         long = lengths(normals := normals.astype(np.float64))
         normals = np.where(long > 0, normals.T / np.maximum(long, 1e-12), np.nan).T
+        if not (long > 0).any():
+            normals = None
+            notes.append("not used: its normals, which are all 0")
     return ReadCloud(
         points,
         unit,

@@ -344,7 +344,7 @@ def _apply_conventions(
         text = f"axis {axis}: {100 * explained:.0f} % of the pixels fit this code"
         findings.doubts.append((images, f"{text}, of {100 * MOST_EXPLAINED:.0f} % at least"))
     if parts.runs and parts.runs[-1].gradient["xy".index(axis)] * sequence.sign(axis) < 0:
-        text = _describe_reversal(axis, "the code falls", "or a most significant bit is missing")
+        text = describe_reversal(axis, "the code falls", "or a most significant bit is missing")
         findings.doubts.append((images, text))
     return sequence
 
@@ -450,7 +450,7 @@ def _check_fringes(
     """Return the sequence of fringes without a code, marked as relative where they have one
     period."""
     if runs[-1].gradient["xy".index(axis)] < 0:
-        text = _describe_reversal(axis, "the phase falls", "or phase_sign is -1")
+        text = describe_reversal(axis, "the phase falls", "or phase_sign is -1")
         findings.doubts.append((_list_images(sequence, axis), text))
     if len(runs) == 1:
         findings.notes.append(
@@ -531,7 +531,7 @@ def _mark_complementary(sequence: PatternSequence, axis: Axis, image: int) -> Pa
     return replace(sequence, frames=tuple(frames))
 
 
-def _describe_reversal(axis: Axis, observation: str, other: str) -> str:
+def describe_reversal(axis: Axis, observation: str, other: str) -> str:
     """Return the text of the doubt that an axis is reversed, by a device turned by 180 degrees or
     by ``other``."""
     side = "to the right" if axis == "x" else "downwards"

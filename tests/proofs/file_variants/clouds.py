@@ -2,7 +2,7 @@
 
 import io
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -527,39 +527,113 @@ def draw_las(rng: np.random.Generator) -> Variant:
     return Variant("las", form.text(), name, content, truth if is_metric else None, (), reasons)
 
 
+def write_e57(fields: Sequence[Property], pose: np.ndarray | None = None, limits: int = 0) -> bytes:
+    """Return an E57 of one scan, by the nodes of libe57. ``fields``: of types "double", "float",
+    "scaled", or "int 255" by the largest number. ``pose``: a quaternion, then a shift in metres;
+    ``limits``: the largest level of a colour that the scan states, 0 for none."""
+    from pye57 import E57, libe57
+
+    with TemporaryDirectory() as folder:
+        file = E57(str(path := Path(folder, "a.e57")), mode="w")
+        image = file.image_file
+        image.extensionsAdd("my", "http://example.org/my")
+        number = {
+            "double": lambda top: libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE),
+            "float": lambda top: libe57.FloatNode(image, 0.0, libe57.E57_SINGLE, -1e30, 1e30),
+            "scaled": lambda top: libe57.ScaledIntegerNode(image, 0, -(2**40), 2**40, 1e-8),
+            "int": lambda top: libe57.IntegerNode(image, 0, 0, top),
+        }
+        prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+        columns = [np.ascontiguousarray(values, np.float64) for _, _, values in fields]
+        for (name, kind, _), values in zip(fields, columns, strict=True):
+            of, _, top = kind.partition(" ")
+            prototype.set(name, number[of](int(top or 0)))
+            count = len(values)
+            buffers.append(libe57.SourceDestBuffer(image, name, values, count, True, True))
+        scan = libe57.StructureNode(image)
+        file.data3d.append(scan)
+        scan.set("guid", libe57.StringNode(image, "{of a proof}"))
+        if limits:
+            node = libe57.StructureNode(image)
+            for name in ("colorRed", "colorGreen", "colorBlue"):
+                node.set(f"{name}Minimum", libe57.IntegerNode(image, 0))
+                node.set(f"{name}Maximum", libe57.IntegerNode(image, limits))
+            scan.set("colorLimits", node)
+        if pose is not None:
+            node = libe57.StructureNode(image)
+            for part, axes, values in (
+                ("rotation", "wxyz", pose[:4]),
+                ("translation", "xyz", pose[4:]),
+            ):
+                inner = libe57.StructureNode(image)
+                for axis, value in zip(axes, values, strict=True):
+                    inner.set(axis, libe57.FloatNode(image, float(value)))
+                node.set(part, inner)
+            scan.set("pose", node)
+        vector = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+        scan.set("points", vector)
+        writer = vector.writer(buffers)
+        writer.write(count)
+        writer.close()
+        file.close()
+        return path.read_bytes()
+
+
 def draw_e57(rng: np.random.Generator) -> Variant:
     """Draw an E57 of one scan."""
-    import pye57
-
     form, truth = Form(rng), draw_surface(rng, _SIZE)
     assert truth.colours is not None
-    fields = dict(
-        zip(("cartesianX", "cartesianY", "cartesianZ"), truth.points.T / 1e3, strict=True)
+    count, points, metres = len(truth.points), truth.points, truth.points.T / 1e3
+    colours = truth.colours
+    names = ["cartesianX", "cartesianY", "cartesianZ"]
+    places, kind = metres, form.draw("places", "double", "float", "scaled", "polar")
+    if kind == "polar":
+        reach = np.linalg.norm(metres, axis=0)
+        elevation = np.arcsin(metres[2] / reach)
+        places = np.stack([reach, np.arctan2(metres[1], metres[0]), elevation])
+        names = ["sphericalRange", "sphericalAzimuth", "sphericalElevation"]
+    of = "double" if kind == "polar" else kind
+    columns = list(zip(names, [of] * 3, places, strict=True))
+    top = {"8 bits": 255, "10 bits": 1023, "16 bits": 65535, "fractions": 1}.get(
+        form.draw("colours", "none", "8 bits", "10 bits", "16 bits", "fractions"), 0
     )
+    if top:
+        dark = form.draw("brightest", 1.0, 1.0, 0.5)
+        levels = np.rint(colours * dark)
+        shown = levels / 255 if top == 1 else np.rint(levels * (top / 255))
+        colours = np.rint(255 * shown / top).astype(np.uint8)
+        name_of = ("colorRed", "colorGreen", "colorBlue")
+        node = "float" if top == 1 else f"int {top}"
+        columns += zip(name_of, [node] * 3, shown.T, strict=True)
+    limits = top if form.draw("limits", False, True) else 0
     scalars = dict[str, np.ndarray]()
-    if colours := form.draw("colours", False, True):
-        names = ("colorRed", "colorGreen", "colorBlue")
-        fields |= dict(zip(names, truth.colours.T, strict=True))
-    if form.draw("intensity", False, True):
-        fields["intensity"] = rng.uniform(size=len(truth.points))
-        scalars["intensity"] = fields["intensity"]
-    if form.draw("rows", False, True):
-        index = np.arange(len(truth.points))
-        scalars |= {"rowIndex": index // _SIZE, "columnIndex": index % _SIZE}
-        fields |= scalars
-    turned = form.draw("pose", False, True)
-    with TemporaryDirectory() as folder:
-        file = pye57.E57(str(path := Path(folder, "a.e57")), mode="w")
-        half = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
-        pose = {"rotation": half, "translation": np.array([0.01, 0.02, 0.03])} if turned else {}
-        file.write_scan_raw(fields, **pose)
-        file.close()
-        content = path.read_bytes()
-    points = truth.points
-    if turned:  # by a quarter about z, then shifted
+    for name, kind_of, values in (
+        ("intensity", form.draw("intensity", "double", "scaled"), rng.uniform(size=count)),
+        ("rowIndex", f"int {_SIZE}", np.arange(count) // _SIZE),
+        ("timeStamp", "double", np.sort(rng.uniform(0, 60, count))),
+        ("my:temperature", "float", np.round(rng.uniform(15, 30, count), 3).astype(np.float32)),
+        ("isColorInvalid", "int 1", rng.integers(0, 2, count)),
+    ):
+        if form.draw(name, False, True):
+            columns.append((name, kind_of, values))
+            scalars[name.rpartition(":")[2]] = values
+    is_valid, extras = np.ones(count, bool), list[list[str]]()
+    if form.draw("invalid", False, False, True):
+        of_kind = "spherical" if kind == "polar" else "cartesian"
+        states = rng.choice([0, 0, 0, 1, 2], count)
+        is_valid, extras = states == 0, [["invalid"]]
+        columns.append((f"{of_kind}InvalidState", "int 2", states))
+    pose = None
+    if form.draw("pose", False, True):  # a quarter about z, then shifted
+        pose = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5), 0.01, 0.02, 0.03])
         points = np.stack([10 - points[:, 1], 20 + points[:, 0], 30 + points[:, 2]], axis=1)
-    truth = Points(points, truth.colours if colours else None, scalars=scalars)
-    return Variant("e57", form.text(), "a.e57", content, truth)
+    content = write_e57(columns, pose, limits)
+    truth = Points(
+        points[is_valid],
+        colours[is_valid] if top else None,
+        scalars={name: values[is_valid] for name, values in scalars.items()},
+    )
+    return Variant("e57", form.text(), "a.e57", content, truth, extras=extras)
 
 
 def cut(draw: Callable[[np.random.Generator], Variant], rng: np.random.Generator) -> Variant:

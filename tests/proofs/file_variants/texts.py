@@ -40,6 +40,15 @@ _NORMALS = {
 }
 
 
+def _mark_number(text: str, decimals: str, thousands: str) -> str:
+    """Return a number with another mark of decimals, and one between thousands where it has
+    decimals too."""
+    whole, point, rest = text.partition(".")
+    if thousands and point:
+        whole = f"{int(whole):,}".replace(",", thousands) if whole != "-0" else whole
+    return whole + (decimals if point else "") + rest
+
+
 def draw_table(rng: np.random.Generator) -> Variant:
     """Draw a table whose header names its columns."""
     form, truth = Form(rng), draw_surface(rng, _SIZE)
@@ -86,9 +95,15 @@ def draw_table(rng: np.random.Generator) -> Variant:
         lines.append(separator.join((unit or "mm") if n in named else "" for n, _ in columns))
     if not is_stated or (form.draw("commented", False, False, True) and prefix):
         lines.insert(0, f"{prefix or '# '}{draw_comment(form, unit)}")
+    marks = form.draw("thousands", "", "", "", "," if decimals == "." else ".")
+    is_quoted = separator == "," and form.draw("cells", "plain", "plain", "quoted") == "quoted"
     for row in zip(*(values for _, values in columns), strict=True):
-        line = separator.join(row)
-        lines.append(line.replace(".", ",") if decimals == "," else line)
+        cells = [_mark_number(each, decimals, marks) for each in row]
+        if is_quoted:  # as programs of countries with decimal commas write them
+            cells = [f'"{_mark_number(each, ",", "")}"' for each in row]
+        elif separator == "," and marks:
+            cells = [f'"{each}"' if "," in each else each for each in cells]
+        lines.append(separator.join(cells))
     mark = "\ufeff" if form.draw("mark", False, False, True) else ""
     content = end_lines(mark + "\n".join(lines) + "\n", form.draw("end", "\n", "\r\n"))
     truth = Points(
