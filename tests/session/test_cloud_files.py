@@ -303,3 +303,12 @@ def test_unlikely_sizes_name_the_units_that_fit(size: float, unit: str, named: l
     points = np.array([[0.0, 0, 0], [size, 0, 0]])
     warning = unit_warning("a", points, unit)  # type: ignore[arg-type]
     assert re.findall(r"--unit (\w+)", warning) == named
+
+
+def test_whole_numbers_of_three_digits_are_no_thousands(tmp_path: Path) -> None:
+    """A table of pixels and depths: 100,200,500.12."""
+    u, v = np.mgrid[100:140, 200:240].reshape(2, -1)
+    table = np.column_stack([u, v, 500 + 0.013 * u])
+    path = tmp_path / "depths.csv"
+    np.savetxt(path, table, ["%d", "%d", "%.3f"], delimiter=",")
+    np.testing.assert_allclose(read(path).points, table, atol=1e-3)

@@ -23,10 +23,10 @@ _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(?i:nan|inf)")
 _COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _QUOTED = re.compile(r'"([^"\n]*)"')
-_THOUSANDS = re.compile(
-    r"(?<![-+\d.,])([-+]?\d{1,3})((?:,\d{3})+(?=\.)|(?:\.\d{3})+(?=,))([.,]\d+)(?![\d.,])"
-)
-"""Numbers with marks between thousands: 1,234.5 or 1.234,5."""
+_GROUPED = r"([-+]?\d{1,3})((?:,\d{3})+(?=\.)|(?:\.\d{3})+(?=,))([.,]\d+)"
+_THOUSANDS = re.compile(rf'(?:^|(?<=[ \t;"])){_GROUPED}(?=[ \t;"])|(?<=[ \t;"]){_GROUPED}$', re.M)
+"""Numbers with marks between thousands, 1,234.5 or 1.234,5, beside others: a line alone may be
+x,y,z."""
 _NO_NUMBER = re.compile(r"[-+]?(?:1\.#[A-Z]+|(?i:nan)\(\w+\))")
 """How programs on Windows write NaN and infinity."""
 _UNIT = re.compile(r"[\[(][^\])]+[\])]")
@@ -75,8 +75,8 @@ def _read_lines(name: str, data: bytes, notes: list[str]) -> _Lines:
     """Return the lines of a text that are not empty. Raises InputError without any of three
     numbers, and for blocks of other numbers of points than announced."""
     text = data.decode("utf-16" if data[:2] in _UTF16 else "utf-8-sig", "replace")
-    text = _settle_marks(_NO_NUMBER.sub("nan", text), notes)
-    lines = [line for line in map(str.strip, text.splitlines()) if line]
+    text = "\n".join(filter(None, map(str.strip, text.splitlines())))
+    lines = _settle_marks(_NO_NUMBER.sub("nan", text), notes).split("\n")
     first = next((i for i, line in enumerate(lines) if len(_number_places(line)) >= 3), None)
     if first is None:
         raise InputError(
@@ -97,7 +97,13 @@ def _read_lines(name: str, data: bytes, notes: list[str]) -> _Lines:
 def _settle_marks(text: str, notes: list[str]) -> str:
     """Return a text without marks between thousands and without quotes, in which no separator
     lies."""
-    text, grouped = _THOUSANDS.subn(lambda m: m[1] + re.sub("[.,]", "", m[2]) + m[3], text)
+
+    def join(match: re.Match[str]) -> str:
+        """Return a number without marks between thousands."""
+        whole, marked, decimals = filter(None, match.groups())
+        return whole + re.sub("[.,]", "", marked) + decimals
+
+    text, grouped = _THOUSANDS.subn(join, text)
     if grouped:
         notes.append("the marks between thousands in its numbers were left out")
     cells = [cell for cell in _QUOTED.findall(text) if _COMMA.fullmatch(cell)]
