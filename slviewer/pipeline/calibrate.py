@@ -83,7 +83,7 @@ from slviewer.records.verdict import Verdict
 from slviewer.session.capture import Capture
 from slviewer.session.exporters import write_calibration
 from slviewer.session.importers.camera_file import read_camera_file
-from slviewer.session.importers.images import read_image, warn_of_alpha
+from slviewer.session.importers.images import read_image, warn_of_unread
 from slviewer.session.importers.imported import images_by_name
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
@@ -581,7 +581,7 @@ def calibrate_camera_alone(
         raise InputError(
             f"{source} is not a folder", "give a folder of pictures of the board, or a session"
         )
-    for warning in warn_of_alpha([each for each in there if isinstance(each, Path)]):
+    for warning in warn_of_unread([each for each in there if isinstance(each, Path)]):
         warn(warning)
     pictures = {each.name: each for each in there}
     without = match_names([*pictures], exclude, "picture")

@@ -13,10 +13,11 @@ from PIL import Image
 
 from slviewer.errors import InputError
 from slviewer.session.importers.images import (
+    INTERPRETATION_TAG,
     ORIENTATION_TAG,
     read_frames,
     read_image,
-    warn_of_alpha,
+    warn_of_unread,
 )
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
@@ -73,8 +74,37 @@ def test_an_alpha_channel_is_left_aside_and_named(tmp_path, suffix):
     path.write_bytes(encoded(suffix, np.dstack([PIXELS, PIXELS[::-1], PIXELS, PIXELS // 2])))
     plain.write_bytes(encoded(suffix))
     np.testing.assert_array_equal(read_image(path)[..., 1], PIXELS[::-1])
-    (warning,) = warn_of_alpha([plain, path, tmp_path / "absent.png"])
+    (warning,) = warn_of_unread([plain, path, tmp_path / "absent.png"])
     assert path.name in warning and "alpha" in warning and plain.name not in warning
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("interpretation", [0, 1])
+def test_a_tiff_whose_zero_is_white_is_read_as_it_is_shown(tmp_path, bits, interpretation):
+    pixels = (257 * PIXELS.astype(int) >> (16 - bits)).astype(f"uint{bits}")
+    height, width = pixels.shape
+    tags = [
+        (256, width),
+        (257, height),
+        (258, bits),
+        (259, 1),
+        (INTERPRETATION_TAG, interpretation),
+    ]
+    tags += [(273, 8), (277, 1), (278, height), (279, pixels.nbytes)]
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    directory = struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0)
+    head = b"II*\0" + struct.pack("<I", 8 + pixels.nbytes)
+    (tmp_path / "a.tif").write_bytes(head + pixels.tobytes() + directory)
+    shown = pixels if interpretation else np.invert(pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), shown)
+
+
+def test_further_images_in_a_file_are_named(tmp_path):
+    path, pages = tmp_path / "a.tif", [Image.fromarray(PIXELS), Image.fromarray(PIXELS[::-1])]
+    pages[0].save(path, save_all=True, append_images=pages[1:])
+    np.testing.assert_array_equal(read_image(path), PIXELS)
+    (warning,) = warn_of_unread([path])
+    assert path.name in warning and "first of several" in warning
 
 
 def test_a_damaged_png_is_refused(tmp_path):

@@ -44,7 +44,9 @@ warnings.filterwarnings("ignore", module=r"PIL\.")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHECKED = (_PNG, b"\xff\xd8", b"BM")
 """Beginnings of PNG, JPEG and BMP files, which OpenCV may decode as far as they go."""
-ORIENTATION_TAG = 274
+ORIENTATION_TAG, INTERPRETATION_TAG = 274, 262
+WHITE_IS_ZERO = 0
+"""Of the tag of interpretation; OpenCV turns such images of 8 bits round, and those of 16 not."""
 _TURNS_BACK: Mapping[int, Callable[[np.ndarray], np.ndarray]] = {
     2: np.fliplr,
     3: lambda pixels: np.rot90(pixels, 2),
@@ -177,11 +179,13 @@ def read_image(path: Path) -> np.ndarray:
         raise InputError(f"{name} is empty", "copy or record it again")
     if is_raw(path):
         return cv2.cvtColor(develop(data, name, MAX_PIXELS).rgb, cv2.COLOR_RGB2BGR)
-    width = height = orientation = 0
+    width = height = 0
+    orientation, is_negative = None, False
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
             width, height = image.size
-            orientation = _read_orientation(image)
+            orientation = _read_tag(image, ORIENTATION_TAG)
+            is_negative = _read_tag(image, INTERPRETATION_TAG) == WHITE_IS_ZERO
             if width * height <= MAX_PIXELS and data.startswith(_CHECKED):
                 (image.verify if data.startswith(_PNG) else image.load)()
     except Exception as error:  # a malformed file may make Pillow fail in any way
@@ -207,30 +211,36 @@ def read_image(path: Path) -> np.ndarray:
         )
     if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
         raise InputError(f"{name} has {pixels.shape[2]} channels", "save frames in grey or RGB")
-    pixels = _TURNS_BACK.get(orientation, np.asarray)(pixels)
+    if is_negative and pixels.dtype == np.uint16:
+        pixels = np.invert(pixels)
+    pixels = _TURNS_BACK.get(orientation or 0, np.asarray)(pixels)
     return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., :3])
 
 
-def _read_orientation(image: Image.Image) -> int:
-    """Return the orientation in which OpenCV reads an image, as in EXIF; 0 where it does not turn
-    it."""
-    return image.getexif().get(ORIENTATION_TAG, 0) if image.format == "TIFF" else 0
+def _read_tag(image: Image.Image, tag: int) -> int | None:
+    """Return a tag of a TIFF; None where there is none, and for other formats: OpenCV turns none of
+    these."""
+    return image.getexif().get(tag) if image.format == "TIFF" else None
 
 
-def warn_of_alpha(paths: Sequence[Path]) -> list[str]:
-    """A warning that images have a channel that `read_image` leaves aside, by their headers, as a
-    list of one, or of none."""
-    named = []
+def warn_of_unread(paths: Sequence[Path]) -> list[str]:
+    """Warnings that images have a channel, or files further images, that `read_image` leaves aside,
+    by their headers."""
+    transparent, paged = [], []
     for path in paths:
         with (
             suppress(OSError, SyntaxError, ValueError),
             Image.open(path, formats=_FORMATS) as image,
         ):
             if image.mode in ("LA", "PA", "RGBA"):
-                named.append(path.name)
-    if not named:
-        return []
-    return [f"{join_names(named)}: transparency (an alpha channel) is ignored"]
+                transparent.append(path.name)
+            if getattr(image, "n_frames", 1) > 1:
+                paged.append(path.name)
+    listed = {
+        "transparency (an alpha channel) is ignored": transparent,
+        "the first of several images in one file is read; save each as a file of its own": paged,
+    }
+    return [f"{join_names(names)}: {what}" for what, names in listed.items() if names]
 
 
 def is_raw(path: Path) -> bool:

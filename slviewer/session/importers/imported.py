@@ -19,7 +19,7 @@ from slviewer.session.importers.images import (
     Channel,
     is_raw,
     read_frames,
-    warn_of_alpha,
+    warn_of_unread,
 )
 from slviewer.session.names import join_names, natural_key, new_name, plain_name
 from slviewer.session.reading import expand_user
@@ -110,7 +110,7 @@ class Imports:
             for message in unknown_files_warning(each.source, each.unknown)
         )
         firsts = [each.files[0] for each in self.recordings if each.files]
-        return [*self.messages, *unknown, *warn_of_alpha(firsts)]
+        return [*self.messages, *unknown, *warn_of_unread(firsts)]
 
     def __len__(self) -> int:
         return len(self.recordings)
