@@ -293,6 +293,8 @@ def _read_ply(name: str, data: bytes, notes: list[str]) -> Polygons:
     rows = _read_elements(name, body, order, elements, unused)
     lists = [each for each, _, length in elements["vertex"][1] if length]
     columns = {each: values for each, (values, _) in rows["vertex"].items() if each not in lists}
+    for axis in set(PLACE) - columns.keys() if {*map(str.upper, PLACE)} <= columns.keys() else ():
+        columns[axis] = columns.pop(axis.upper())
     faces = rows.get("face", {})
     indices = next((each for each in ("vertex_indices", "vertex_index") if each in faces), "")
     if not {*PLACE} <= columns.keys() or (faces and not indices):

@@ -312,3 +312,12 @@ def test_whole_numbers_of_three_digits_are_no_thousands(tmp_path: Path) -> None:
     path = tmp_path / "depths.csv"
     np.savetxt(path, table, ["%d", "%d", "%.3f"], delimiter=",")
     np.testing.assert_allclose(read(path).points, table, atol=1e-3)
+
+
+def test_coordinates_of_a_ply_in_capitals_are_read(tmp_path: Path) -> None:
+    properties = "\n".join(f"property float {axis}" for axis in "XYZ")
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(POINTS)}\n{properties}\nend_header\n"
+    with (tmp_path / "a.ply").open("w") as file:
+        file.write(head)
+        np.savetxt(file, POINTS, "%.4f")
+    np.testing.assert_allclose(read(tmp_path / "a.ply").points, POINTS, atol=1e-3)
