@@ -179,13 +179,35 @@ def read_image(path: Path) -> np.ndarray:
         raise InputError(f"{name} is empty", "copy or record it again")
     if is_raw(path):
         return cv2.cvtColor(develop(data, name, MAX_PIXELS).rgb, cv2.COLOR_RGB2BGR)
+    orientation, interpretation = _check_header(data, name)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError):
+        pixels = None
+    if pixels is None:
+        raise InputError(f"{name} is not a readable image", "copy or record it again")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"{name} has pixels of type {pixels.dtype}", "save frames with 8 or 16 bits"
+        )
+    if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
+        raise InputError(f"{name} has {pixels.shape[2]} channels", "save frames in grey or RGB")
+    if interpretation == WHITE_IS_ZERO and pixels.dtype == np.uint16:
+        pixels = np.invert(pixels)
+    pixels = _TURNS_BACK.get(orientation or 0, np.asarray)(pixels)
+    return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., :3])
+
+
+def _check_header(data: bytes, name: str) -> tuple[int | None, int | None]:
+    """Return orientation and interpretation of a TIFF, each None where it states none, and for
+    other formats: OpenCV turns none of these. Raises InputError for what is too large, or cut
+    short."""
     width = height = 0
-    orientation, is_negative = None, False
+    tags: Mapping[int, int] = {}
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
             width, height = image.size
-            orientation = _read_tag(image, ORIENTATION_TAG)
-            is_negative = _read_tag(image, INTERPRETATION_TAG) == WHITE_IS_ZERO
+            tags = image.getexif() if image.format == "TIFF" else {}
             if width * height <= MAX_PIXELS and data.startswith(_CHECKED):
                 (image.verify if data.startswith(_PNG) else image.load)()
     except Exception as error:  # a malformed file may make Pillow fail in any way
@@ -199,28 +221,7 @@ def read_image(path: Path) -> np.ndarray:
             " are read",
             "crop it, or record it at a lower resolution",
         )
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (cv2.error, MemoryError):
-        pixels = None
-    if pixels is None:
-        raise InputError(f"{name} is not a readable image", "copy or record it again")
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            f"{name} has pixels of type {pixels.dtype}", "save frames with 8 or 16 bits"
-        )
-    if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
-        raise InputError(f"{name} has {pixels.shape[2]} channels", "save frames in grey or RGB")
-    if is_negative and pixels.dtype == np.uint16:
-        pixels = np.invert(pixels)
-    pixels = _TURNS_BACK.get(orientation or 0, np.asarray)(pixels)
-    return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., :3])
-
-
-def _read_tag(image: Image.Image, tag: int) -> int | None:
-    """Return a tag of a TIFF; None where there is none, and for other formats: OpenCV turns none of
-    these."""
-    return image.getexif().get(tag) if image.format == "TIFF" else None
+    return tags.get(ORIENTATION_TAG), tags.get(INTERPRETATION_TAG)
 
 
 def warn_of_unread(paths: Sequence[Path]) -> list[str]:
