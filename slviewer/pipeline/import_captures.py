@@ -430,11 +430,28 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
     sequence, phases = _decode_described(replace(capture, sequence=sequence), warn)
     warn_of_exposure(capture.name, sequence, frames, phases, warn)
     for axis, decoded in phases.items():
+        if unneeded := _describe_unneeded_bits(sequence, axis):
+            warn(f"{capture.name}: {unneeded}")
         if other := _explain_fall(sequence, decoded):
             warn(f"{capture.name}: {describe_reversal(axis, 'the coordinate falls', other)}")
         if rounded := find_rounded_periods(sequence, frames, decoded):
             sequence = _take_periods(capture.name, sequence, axis, rounded, warn)
     return replace(capture, sequence=sequence)
+
+
+def _describe_unneeded_bits(sequence: PatternSequence, axis: Axis) -> str:
+    """Return that a code has more bits than the cells of the projector need, in words; empty where
+    it has not: cells that are described too wide double the coordinates, and nothing shows it."""
+    bits, cell = len(sequence.find("gray", axis)), sequence.gray_cell(axis)
+    if not bits or sequence.projector_size is None:
+        return ""
+    cells = int(np.ceil((sequence.extent(axis) - sequence.origin_px(axis) - 0.5) / cell))
+    if 2 ** (bits - 1) < cells:
+        return ""
+    return (
+        f"axis {axis} has {bits} bits, and its {cells} cells of {cell:g} px need fewer: see that"
+        " gray_cell_px and the projector's size are right"
+    )
 
 
 def _explain_fall(sequence: PatternSequence, decoded: PhaseMap) -> str:

@@ -7,9 +7,9 @@
 const buttonHints = new Map();
 // Colours of the lines of the floor, in the light and in the dark theme.
 const FLOOR = { false: [[225, 229, 233], [190, 196, 202]], true: [[42, 45, 48], [62, 66, 70]] };
-// Until the wizard is drawn, the client would show a panel of its own, for seconds on a slow machine; where none comes, that
-// says why. Views of scripts have no path, and no line of state.
-if (location.pathname.length > 1) {
+// Until the server's first messages are drawn, the client would show a panel of its own, for seconds on a slow machine; where
+// none come, that says why. A wizard is drawn once its line of state is.
+const starting = (() => {
   const { dataset } = document.documentElement;
   const show = () => {
     delete dataset.starting;
@@ -19,7 +19,14 @@ if (location.pathname.length > 1) {
   watcher.observe(document, { childList: true, subtree: true });
   dataset.starting = "";
   setTimeout(show, 20000);
-}
+  let isWizard = false;
+  return {
+    end(messages) {
+      isWizard ||= messages.some(({ props }) => props?.content?.includes?.("data-activity"));
+      if (!isWizard) show();
+    },
+  };
+})();
 (() => {
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const onmessage = Object.getOwnPropertyDescriptor(Worker.prototype, "onmessage");
@@ -59,6 +66,7 @@ if (location.pathname.length > 1) {
           } catch (error) {
             reportError(error); // and the rest is still handed over
           }
+          if (data?.type === "message_batch") starting.end(data.messages);
         }
       };
       onmessage.set.call(this, ({ data }) => {

@@ -16,7 +16,11 @@ from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray, gray_bits, phase_steps
 from slviewer.fringe.sequence import PatternSequence, PerAxis
 from slviewer.pipeline.capture_phases import decode_capture
-from slviewer.pipeline.import_captures import find_captures, import_captures
+from slviewer.pipeline.import_captures import (
+    _describe_unneeded_bits,
+    find_captures,
+    import_captures,
+)
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,
@@ -384,3 +388,10 @@ def test_exchanged_inverses_of_a_binary_code_are_mentioned(
     warnings = list[str]()
     import_captures(tmp_path, tmp_path / "session", "frames", role="scan", warn=warnings.append)
     assert ("inverses are exchanged" in " ".join(warnings)) == is_exchanged
+
+
+def test_bits_that_no_cell_needs_are_mentioned() -> None:
+    sequence = gray((684, 512))
+    assert not any(_describe_unneeded_bits(sequence, axis) for axis in ("x", "y"))
+    wide = replace(sequence, gray_cell_px=2.0)
+    assert not missing_facts(_describe_unneeded_bits(wide, "x"), "342 cells of 2 px", "10 bits")
