@@ -121,8 +121,9 @@ def test_view_keeps_most_of_the_page_in_the_theme_of_the_system(opened: Opened) 
 def test_live_image_is_enlarged_by_click_and_by_key(opened: Opened) -> None:
     page = opened.page
     click(page, "1. Rig")
-    # the step of before goes a moment later, and its own live image with it
-    expect(page.get_by_text("Choose your board, or print one")).to_be_hidden()
+    # the panel of before goes a moment later, and its own live image with it
+    expect(button(page, "Check rig")).to_be_visible()
+    expect(button(page, "Create PDF")).to_be_hidden()
     image = button(page, "Camera image")
     image.wait_for()
 
