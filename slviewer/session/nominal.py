@@ -186,7 +186,9 @@ def _repair(
         if closed:
             break
     notes += repairs
-    if loose := len(vertices) - len(np.unique(faces)):
+    has_triangle = np.zeros(len(vertices), bool)
+    has_triangle[faces] = True
+    if loose := np.count_nonzero(~has_triangle):
         notes.append(f"not used: {loose:,} of {len(vertices):,} points, which no triangle has")
     used, found = np.unique(found[_have_area(vertices, found)], return_inverse=True)
     return Mesh(vertices[used].astype(np.float32), found.reshape(-1, 3).astype(np.int32)), closed

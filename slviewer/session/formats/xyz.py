@@ -76,7 +76,11 @@ def _read_lines(name: str, data: bytes, notes: list[str]) -> _Lines:
     numbers, and for blocks of other numbers of points than announced."""
     text = data.decode("utf-16" if data[:2] in _UTF16 else "utf-8-sig", "replace")
     text = "\n".join(filter(None, map(str.strip, text.splitlines())))
-    lines = _settle_marks(_NO_NUMBER.sub("nan", text), notes).split("\n")
+    if (
+        "#" in text or "(" in text
+    ):  # a search through all of a large text takes longer than the rest
+        text = _NO_NUMBER.sub("nan", text)
+    lines = _settle_marks(text, notes).split("\n")
     first = next((i for i, line in enumerate(lines) if len(_number_places(line)) >= 3), None)
     if first is None:
         raise InputError(
@@ -103,9 +107,12 @@ def _settle_marks(text: str, notes: list[str]) -> str:
         whole, marked, decimals = filter(None, match.groups())
         return whole + re.sub("[.,]", "", marked) + decimals
 
-    text, grouped = _THOUSANDS.subn(join, text)
-    if grouped:
-        notes.append("the marks between thousands in its numbers were left out")
+    if all(mark in text for mark in ",.") and any(each in text for each in ' \t;"'):
+        text, grouped = _THOUSANDS.subn(join, text)
+        if grouped:
+            notes.append("the marks between thousands in its numbers were skipped")
+    if '"' not in text:
+        return text
     cells = [cell for cell in _QUOTED.findall(text) if _COMMA.fullmatch(cell)]
     if cells:
         notes.append(f"the commas in its quoted numbers were read as decimal points: {cells[0]}")
