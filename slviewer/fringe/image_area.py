@@ -300,7 +300,7 @@ def _find_unlit_blocks(frames: np.ndarray) -> Mask:
     together = squares - means**2 / n
     each = own - _average_blocks(sums**2) / n
     freedom = n - 1
-    low, high = scipy.stats.chi2.ppf([CHANCE, 1 - CHANCE], freedom) / freedom
+    low, high = scipy.special.chdtri(freedom, [1 - CHANCE, CHANCE]) / freedom
     is_unlit = (pixels * together > low * each) & (pixels * together < high * each)
     level = (first + sums / n)[: rows * BLOCK_PX, : columns * BLOCK_PX]
     level -= cv2.resize(_average_blocks(level), level.shape[::-1], interpolation=cv2.INTER_NEAREST)

@@ -115,23 +115,31 @@ class NominalSurface:
         face = nearest["primitive_ids"].numpy().astype(np.int64)
         s, t = nearest["primitive_uvs"].numpy().astype(np.float64).T
         offsets = centred - nearest["points"].numpy().astype(np.float64)
-        normals = self._flat[face]
+        towards = self._flat[face]
+        facing = towards.copy()
         # inside a triangle its own plane says how far; at a side or corner the direction does, and
         # the side of the surface follows from the normals of the vertices there
-        at_side = (s < CORNER) | (t < CORNER) | (1 - s - t < CORNER)
-        away = np.sum(normals * offsets, axis=1)
-        weights, corners = np.stack([1 - s - t, s, t], axis=1), self._faces[face]
+        away = np.einsum("ij,ij->i", towards, offsets)
+        at_side = np.flatnonzero((s < CORNER) | (t < CORNER) | (1 - s - t < CORNER))
+        s, t, offsets, corners = (
+            s[at_side],
+            t[at_side],
+            offsets[at_side],
+            self._faces[face[at_side]],
+        )
+        weights = np.stack([1 - s - t, s, t], axis=1)
         smooth = unit_vectors((self._smooth[corners] * weights[..., None]).sum(axis=1))
         gaps, above = lengths(offsets), np.sum(smooth * offsets, axis=1)
         signs = np.where(above < 0, -1.0, 1.0)
-        is_off = at_side & (gaps > NEGLIGIBLE)
-        away = np.where(is_off, signs * gaps, away)
+        is_off, is_clear = gaps > NEGLIGIBLE, gaps > 10 * NEGLIGIBLE
         at_rim = (self._at_rim[corners] | (weights < CORNER)).all(axis=1)
-        away[is_off & at_rim & (np.abs(above) < RIM * gaps)] = np.inf
-        towards = (signs / np.maximum(gaps, 1e-300))[:, None] * offsets
-        is_clear = at_side & (gaps > 10 * NEGLIGIBLE)
-        facing = np.where(at_side[:, None], smooth, normals)
-        return away, np.where(is_clear[:, None], towards, normals), facing
+        beyond = at_rim & (np.abs(above) < RIM * gaps)
+        away[at_side[is_off]] = np.where(beyond, np.inf, signs * gaps)[is_off]
+        towards[at_side[is_clear]] = ((signs / np.maximum(gaps, 1e-300))[:, None] * offsets)[
+            is_clear
+        ]
+        facing[at_side] = smooth
+        return away, towards, facing
 
     def distances(
         self,

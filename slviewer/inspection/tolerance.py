@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import norm
+from scipy.special import erfcx
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, distance_jacobian
@@ -336,8 +336,7 @@ def _join_small(
     """
     noise, bound, doubts = points.noise, bound.copy(), list[str]()
     link, limit = JOINED * spacing, SUSPECT * tolerance
-    cut = (limit - tolerance) / noise
-    chosen_by = noise * norm.pdf(cut) / norm.sf(cut)
+    chosen_by = noise * np.sqrt(2 / np.pi) / erfcx((limit - tolerance) / noise / np.sqrt(2))
     for sign in (-1, 1):
         large = np.flatnonzero(sign * points.value > limit)
         for members in label_clusters(points.place[large], link):
