@@ -210,7 +210,9 @@ class MeasurementList(PanelPart):
         self._lines: Lines = {}
         gui, operator = self._gui, self._operator
         with gui.add_folder("Result") as self._chosen_folder:
-            self._choice = choice = self.choice("Result")
+            self._choice = choice = self.choice(
+                "Result", follow=lambda session: [each.name for each in session.measurements]
+            )
             self._histogram = Plot(gui)
             self._section = Plot(gui)
             self._cursors: list[Any] = [
@@ -282,7 +284,7 @@ class MeasurementList(PanelPart):
         occur twice; returns the chosen one."""
         titles = list(name_records(measured))
         names = [each.name for each in measured]
-        self._choice.offer(dict(zip(titles[::-1], names[::-1], strict=True)), follow=True)
+        self._choice.offer(dict(zip(titles[::-1], names[::-1], strict=True)))
         self._chosen_folder.visible = self._table_folder.visible = bool(measured)
         return next((each for each in measured if each.name == self._choice.value), None)
 

@@ -232,30 +232,37 @@ class Setting:
 
 class Choice:
     """A dropdown whose options stand for values; `value` is the chosen one, empty where there is
-    none."""
+    none. `followed`: returns the values that there are now, and a new one becomes the choice."""
 
-    def __init__(self, handle: Any, options: Mapping[str, Any]) -> None:
-        self.handle = handle
-        self._options = options
-
-    def offer(
-        self, options: Mapping[str, Any], preferred: Any = "", *, follow: bool = False
+    def __init__(
+        self,
+        handle: Any,
+        options: Mapping[str, Any],
+        followed: Callable[[], Iterable[Any]] | None = None,
     ) -> None:
-        """Set the options, {text: value}; the choice stays if possible, else it becomes `preferred`
-        or the first one. `follow`: it becomes what was not offered before, if other things were."""
-        chosen, before, texts = self.value, self._options.values(), tuple(options) or (NOTHING,)
-        new = [value for value in options.values() if value not in before]
-        if follow and before and new:
-            chosen = new[0]
+        self.handle = handle
+        self._options, self._followed, self._known = options, followed, set[Any]()
+        if followed:
+            handle.on_update(self._keep)
+
+    def offer(self, options: Mapping[str, Any], preferred: Any = "") -> None:
+        """Set the options, {text: value}; the choice becomes a new one of those that are followed,
+        else it stays if possible, else it becomes `preferred` or the first one."""
+        chosen, texts = self.value, tuple(options) or (NOTHING,)
+        there = set(self._followed()) if self._followed else set()
+        drawn = [value for value in options.values() if value in there]
+        new = [value for value in drawn if value not in self._known] if self._known else []
+        self._known = (self._known & there).union(drawn)
         self._options = options
-        if self.handle.options != texts:
+        if new or self.handle.options != texts:
             by_value = {value: text for text, value in options.items()}
             self.handle.options = texts
+            chosen = new[0] if new else chosen
             self.handle.value = by_value.get(chosen) or by_value.get(preferred) or texts[0]
 
-    def offer_names(self, names: Iterable[str], preferred: str = "", follow: bool = False) -> None:
+    def offer_names(self, names: Iterable[str], preferred: str = "") -> None:
         """Set options that are called by their names."""
-        self.offer({name: name for name in names}, preferred, follow=follow)
+        self.offer({name: name for name in names}, preferred)
 
     @property
     def value(self) -> Any:
@@ -267,6 +274,12 @@ class Choice:
         for text, each in self._options.items():
             if each == value:
                 self.handle.value = text
+
+    async def _keep(self, event: Any) -> None:
+        """Know what is there when a user chooses: drawn later, it must not take the choice back.
+        Viser calls this before it handles anything else."""
+        if event.client_id is not None and self._followed:
+            self._known = set(self._followed())
 
 
 def display_name(name: str, label: str) -> str:
@@ -511,9 +524,15 @@ class ControlGroup:
         hint: str | None = None,
         options: Mapping[str, Any] | None = None,
         do: Callable[[], Any] | None = None,
+        follow: Callable[[SessionView], Iterable[Any]] | None = None,
     ) -> Choice:
-        """Add a dropdown of values, {text: value}; without `options` they are offered later."""
-        return Choice(self.dropdown(label, options or (NOTHING,), hint, do), options or {})
+        """Add a dropdown of values, {text: value}; without `options` they are offered later. A new
+        one of those that `follow` lists of the session becomes the choice."""
+        handle = self.dropdown(label, options or (NOTHING,), hint, do)
+        if follow is None:
+            return Choice(handle, options or {})
+        operator = self.context.operator
+        return Choice(handle, options or {}, lambda: follow(operator.snapshot().content))
 
     def setting(self, handle: Any, request: Callable[[Any], object]) -> Setting:
         """Bind an input to a value of the session, which it requests."""

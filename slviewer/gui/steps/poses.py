@@ -171,7 +171,9 @@ class PosesPanel(StepPanel):
         )
         with gui.add_folder("Captured poses"):
             self._table = Text(gui)
-            self._chosen = self.choice("Pose")
+            self._chosen = self.choice(
+                "Pose", follow=lambda session: [pose.name for pose in session.poses]
+            )
             self._detail = Text(gui)
             self._actions = {
                 "Exclude": operator.exclude,
@@ -215,7 +217,7 @@ class PosesPanel(StepPanel):
         self._draw_ghost(session)
         self._image = session.plan.image if session.plan else None
         self._play_sound(poses, self.snapshot.hands_free)
-        self._chosen.offer_names((pose.name for pose in reversed(poses)), follow=True)
+        self._chosen.offer_names(pose.name for pose in reversed(poses))
         self._chosen.handle.visible = self._group.visible = bool(poses)
         self._table.set(pose_table(poses))
         self._restore.offer(session.deleted_poses)

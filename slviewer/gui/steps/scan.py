@@ -75,7 +75,6 @@ class ScanPanel(StepPanel):
 
     key = "scan"
 
-    _known: tuple[str, ...] = ()
     _placed: tuple[str, ...] | None = None
     _loaded: tuple[Any, ScanCloud] | None = None
     _made: _Made | None = None
@@ -124,8 +123,7 @@ class ScanPanel(StepPanel):
         ReconstructAllButton(self)
         self._gallery = Text(gui)
         with gui.add_folder("Cloud") as self._cloud_folder:
-            self._scan = scan = self.choice("Scan")
-            scan.handle.on_update(self._keep_choice)
+            self._scan = scan = self.choice("Scan", follow=_reconstructed_names)
             self._figures = Text(gui)
             self._colour = self.dropdown("Colour", SCAN_COLOURINGS)
             self._legend = Text(gui)
@@ -188,21 +186,11 @@ class ScanPanel(StepPanel):
             return
         reconstructed = _reconstructed_names(session)
         self._scan.offer(scan_options(scans), (reconstructed or [""])[0])
-        if new := [name for name in reconstructed if name not in self._known]:
-            if self._known:  # show what was just reconstructed
-                self._scan.choose(new[0])
-            self._known = reconstructed
         if calibration:
             self._model.offer_names(calibration.models, calibration.best)
         else:
             self._model.offer_names(())
         self._draw_scan(next(scan for scan in scans if scan.name == self._scan.value))
-
-    async def _keep_choice(self, event: Any) -> None:
-        """Know what is there when a user chooses a scan: drawn later, it must not take the choice
-        back. Viser calls this before it handles anything else."""
-        if event.client_id is not None:
-            self._known = _reconstructed_names(self._operator.snapshot().content)
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image, and whether what is known of it is at the calibrated depths."""

@@ -45,7 +45,10 @@ class VerifyPanel(StepPanel):
         gui, operator = self._gui, self._operator
         self._waiting: dict[Shape, list[str]] = {}
         with gui.add_folder("Result") as self._result_folder:
-            self._result = self.choice("Result")
+            self._result = self.choice(
+                "Result",
+                follow=lambda session: [row.name for row in session.list_records(Verification)],
+            )
             self._figures = Text(gui)
             self._model = self.choice("3D colours", "The model whose errors colour the cloud")
             self._legend = Text(gui)
@@ -116,7 +119,7 @@ class VerifyPanel(StepPanel):
             button.visible, button.label = n > 1, f"Measure all {n} {shape}s"
         results = {row.name: row for row in rows}
         titles = {display_name(row.name, row.label): row.name for row in rows}
-        self._result.offer(titles, follow=True)  # to what was just measured
+        self._result.offer(titles)
         self._table.set(records_html(rows))
         self._file.set(self.context.links_html(session.exports, TABLE))
         if rows:
