@@ -242,7 +242,7 @@ def _tabulate(start, stop, rig, row, centre, near, far, step, grid, projected):
                     s = (pu if row == 0 else pv) - centre
                     change = target - (c0 + c1 * s) / (1.0 + c2 * s)
                     z = min(max(z + change, first), last)
-                    if not abs(change) > 1e-9 * target:
+                    if not abs(change) > 1e-6 * target:  # the next one is a thousandth of it
                         break
                 s = (pu if row == 0 else pv) - centre
                 correction = z - (c0 + c1 * s) / (1.0 + c2 * s)
