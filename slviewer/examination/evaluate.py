@@ -14,7 +14,7 @@ from slviewer.examination.atoms import Atoms, tabulate_atoms
 from slviewer.examination.match import Match, match, match_alone
 from slviewer.examination.sample import CaptureSample, Sample
 from slviewer.fringe.layout import axis_layout
-from slviewer.fringe.levels import unambiguous_px
+from slviewer.fringe.levels import longest_range, unambiguous_px
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.records.verdict import Cause
 
@@ -50,6 +50,11 @@ class Hypothesis:
         """Pattern frames that are seen in another image than their own, or in none."""
         kinds = self.sequence.frames
         return [i for i, j in enumerate(self.images) if j != i and kinds[i].kind != "texture"]
+
+    @property
+    def is_of_files(self) -> bool:
+        """Whether it is an order that the names of files made, of no certain frames."""
+        return self.cause == "frame-order" and not self.frames
 
     @property
     def loses_images(self) -> bool:
@@ -202,7 +207,8 @@ class Evaluator:
         for axis, sample, m in self.matched(*hypotheses):
             if _is_ambiguous(sequence, axis):
                 continue
-            u = m.coordinate[m.misfit < limits.GOOD]
+            coordinate = _move_inside(sequence, axis, m.coordinate)
+            u = coordinate[m.misfit < limits.GOOD]
             if sequence.projector_size and u.size:
                 share = float(np.mean(u > sequence.extent(axis) + 0.5))
                 if share > limits.OUTSIDE[bool(sequence.find("gray", axis))]:
@@ -211,15 +217,24 @@ class Evaluator:
                 continue
             design, good = np.c_[np.ones(len(sure)), sample.place], sure
             for _ in range(4):  # without the surfaces before or behind most
-                fit, *_ = np.linalg.lstsq(design[good], m.coordinate[good], rcond=None)
-                off = np.abs(design @ fit - m.coordinate)
+                fit, *_ = np.linalg.lstsq(design[good], coordinate[good], rcond=None)
+                off = np.abs(design @ fit - coordinate)
                 good = sure & (off < 3 * np.median(off[good]) + 1)
             slopes.append(fit[:0:-1])
             if float(np.median(m.rise[sure])) * slopes[-1][1 - sample.direction] < 0:
                 folded.append(axis)
-        if len(slopes) < 2:
-            return Coordinates(None, beyond, [])
-        return Coordinates(np.array(slopes), beyond, folded)
+        return Coordinates(np.array(slopes) if len(slopes) == 2 else None, beyond, folded)
+
+
+def _move_inside(sequence: PatternSequence, axis: Axis, coordinate: np.ndarray) -> np.ndarray:
+    """Return coordinates (p,) px of fringes with those before or behind the projector moved by the
+    range after which the fringes repeat, where that moves them into it."""
+    if sequence.projector_size is None or sequence.find("gray", axis):
+        return coordinate
+    extent, reach = sequence.extent(axis), longest_range(sequence.periods_px(axis))
+    sign = np.where(coordinate < -0.5, 1, np.where(coordinate > extent - 0.5, -1, 0))
+    moved = coordinate + sign * reach
+    return np.where((moved >= -0.5) & (moved <= extent - 0.5), moved, coordinate)
 
 
 def _is_matchable(images: Sequence[int | None]) -> bool:

@@ -8,11 +8,12 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, Hypothesis, described, use_one_thread
-from slviewer.examination.explain import Explanation, explain, list_unresolved
+from slviewer.examination.explain import Explanation, explain, list_unresolved, measure_levels
 from slviewer.examination.findings import (
     LINES,
     REMEDIES,
     contradict,
+    describe_apart_periods,
     describe_gamma,
     describe_ghost,
     describe_hypothesis,
@@ -26,12 +27,13 @@ from slviewer.examination.findings import (
     wrap,
 )
 from slviewer.examination.ghost import has_ghost
+from slviewer.examination.hypotheses import list_descriptions
 from slviewer.examination.light import Look, equalize_samples, look_at
 from slviewer.examination.motion import is_displaced, measure_motion
 from slviewer.fringe.aliased_harmonics import MOST_STEPS, estimate_aliased_harmonics
 from slviewer.fringe.decoding_task import prepare_decoding
 from slviewer.fringe.frame_light import FrameLight
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.records.verdict import Examination, Finding
 
 
@@ -66,15 +68,30 @@ def _judge(
     coordinates = [*_judge_coordinates(evaluator, base)]
     if found and not _is_imitated(found, evaluator, bool(ghost), bool(motion)):
         named = _describe_explanation(found, evaluator, base)
-        # codes that cannot be are displaced as well
-        if not (coordinates and any(each.cause == "moved" for each in named)):
+        # codes that cannot be are displaced as well, and fit others with fewer images as little
+        has_moved = any(each.cause == "moved" for each in named)
+        if not (coordinates and (has_moved or _explains_little(evaluator, base, found[0]))):
             return named
     if motion and not ghost and not coordinates:
         return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
     judged = [*_judge_readability(evaluator, base), *coordinates]
+    if not judged and not ghost:
+        judged = [
+            describe_apart_periods(sequence, axis, grown)
+            for axis, _, grown in measure_levels(evaluator, base)
+            if grown > limits.GROWN
+        ]
     if ghost:  # it imitates other light
         return [*judged, describe_ghost(ghost)]
     return [*judged, *(_judge_light(sequence, stack, light) if not coordinates else ())]
+
+
+def _explains_little(evaluator: Evaluator, base: Hypothesis, found: Hypothesis) -> bool:
+    """Return whether an order that loses an image leaves most of the misfit."""
+    if not found.loses_images:
+        return False
+    change = evaluator.compare(base, found)
+    return change.left > limits.HALF_LEFT * change.loss
 
 
 def _judge_few_periods(sequence: PatternSequence) -> Iterator[Finding]:
@@ -186,7 +203,20 @@ def _judge_coordinates(evaluator: Evaluator, base: Hypothesis) -> Iterator[Findi
             remedy = error.remedy or REMEDIES["projector-size"]
             yield Finding("projector-size", "rejected", error.observation, remedy, axis=axis)
         elif axis in beyond:
-            yield describe_reach(axis, sequence.extent(axis), *beyond[axis])
+            others = _list_inside(evaluator, base, axis)
+            yield describe_reach(axis, sequence.extent(axis), *beyond[axis], others)
+
+
+def _list_inside(evaluator: Evaluator, base: Hypothesis, axis: Axis) -> Iterator[str]:
+    """Yield the remedies of other bits that explain an axis as well, with codes inside the
+    projector: inverted, plain numbers count backwards."""
+    own = evaluator.match(base, axis)
+    for hypothesis in list_descriptions(base.sequence, axis):
+        other = evaluator.match(hypothesis, axis) if hypothesis.cause == "bit-order" else None
+        if own is None or other is None or axis in evaluator.coordinates(hypothesis).beyond:
+            continue
+        if other.misfit.mean() < own.misfit.mean() + limits.LEFT_ALIKE:
+            yield describe_hypothesis(hypothesis, evaluator, base).remedy
 
 
 def _judge_light(

@@ -9,8 +9,10 @@ import numpy as np
 
 from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, Hypothesis, MisfitChange, described
+from slviewer.examination.findings import contradict
 from slviewer.examination.hypotheses import (
     exchange,
+    lag_from,
     list_descriptions,
     list_lags,
     list_motions,
@@ -21,6 +23,8 @@ from slviewer.examination.hypotheses import (
 from slviewer.examination.match import Match
 from slviewer.examination.motion import has_trend
 from slviewer.examination.sample import Sample
+from slviewer.fringe.layout import axis_layout
+from slviewer.fringe.phase_shifting import fit_ripples, phase_shift
 from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.records.verdict import Cause
 
@@ -45,7 +49,31 @@ def explain(evaluator: Evaluator, base: Hypothesis, has_motion: bool = False) ->
                 explained = _rate(evaluator, base, found)
                 if _rate(evaluator, base, (others,)).comparison.left < explained.most_left:
                     return tuple(_repeat(base.sequence, *pair) for pair in copies)
+    k = _find_repetition(evaluator, base)
+    if k is not None and not any(k in each.frames for each in found):
+        without = tuple(None if i == k else i for i in base.images)
+        others, late = replace(base, images=without), lag_from(base.sequence, k)
+        left, left_late = (evaluator.compare(base, each).left for each in (others, late))
+        is_late = len(late.changed) > 1 and left_late < left
+        return (late if is_late else _repeat(base.sequence, k, k - 1),)
     return found or tuple(_explain_single_images(evaluator, base))
+
+
+def _find_repetition(evaluator: Evaluator, base: Hypothesis) -> int | None:
+    """Return the first frame whose image is equal to the one before in every pixel, where their
+    patterns differ; None where there is none: noise makes two images of anything unlike."""
+    repeated = list[int]()
+    for axis, sample, m in evaluator.matched(base):
+        low, high = np.quantile(m.coordinate, [0.05, 0.95])
+        seen = np.linspace(low, high, len(m.coordinate))  # the match takes up what fine bits show
+        shown = evaluator.atoms(base, axis).at(seen)[m.places]
+        patterns = dict(zip(m.images, shown, strict=True))
+        levels = sample.levels[:, 1]
+        for k in patterns.keys() & {i + 1 for i in patterns}:
+            differs = np.abs(patterns[k] - patterns[k - 1]).mean() > limits.FLAT
+            if differs and np.array_equal(levels[k], levels[k - 1]):
+                repeated.append(k)
+    return min(repeated, default=None)
 
 
 def is_late(evaluator: Evaluator, base: Hypothesis) -> bool:
@@ -77,6 +105,24 @@ def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
     return out
 
 
+def _is_unpredictable(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> bool:
+    """Return whether frame k, which the hypothesis leaves out, is the finest bit of an axis without
+    phase steps, in cells of hardly two pixels: what they show of it no other image tells."""
+    sequence, frame = hypothesis.sequence, hypothesis.sequence.frames[k]
+    axis = frame.axis
+    if (
+        axis is None
+        or sequence.periods_px(axis)
+        or frame.bit + 1 < len(sequence.find("gray", axis))
+    ):
+        return False
+    sample, m = evaluator.sample.by_axis.get(axis), evaluator.match(hypothesis, axis)
+    if sample is None or m is None:
+        return False
+    px = float(np.median(np.abs(m.rise))) / sample.reach_px
+    return sequence.gray_cell(axis) < limits.NARROW * px
+
+
 def _is_too_fine(sequence: PatternSequence, axis: Axis, k: int, sample: Sample, m: Match) -> bool:
     """Return whether the stripes of frame k, a bit of the axis, are narrower than most pixels that
     the match explains: what these show of them follows from no coordinate."""
@@ -88,10 +134,14 @@ def _is_too_fine(sequence: PatternSequence, axis: Axis, k: int, sample: Sample, 
 def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
     """Return whether the description leaves more than noise, in all images or in one, or gives
     coordinates beyond the projector, or that fall from neighbour to neighbour where they rise over
-    the image: aliases, which fit as well where the patterns have few levels."""
+    the image: aliases, which fit as well where the patterns have few levels; or phases of several
+    periods that contradict each other."""
     coordinates = evaluator.coordinates(base)
     if coordinates.beyond or coordinates.folded:
         return True
+    for _, agreement, grown in measure_levels(evaluator, base):
+        if agreement < limits.AGREEING or grown > limits.GROWN:
+            return True
     residuals = evaluator.residuals(base)
     for axis in evaluator.sample.by_axis:
         m = evaluator.match(base, axis)
@@ -105,6 +155,39 @@ def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
     return has_trend(evaluator, base)  # it leaves little that the coordinates do not take up
 
 
+def measure_levels(evaluator: Evaluator, base: Hypothesis) -> Iterator[tuple[Axis, float, float]]:
+    """Yield, of each axis of several periods and no bits, how well the coordinates by a longer
+    period, or a beat, agree with those by the next shorter one beside what gamma does: mean cosine
+    of their distance in the shorter period, the least of all; and the largest distance over the
+    view, in that period, to which it grows from the projector's first column, 0 where it does not
+    grow.
+
+    Another offset or period leaves little of the images in few steps, and may put whole periods
+    off.
+    """
+    sequence = base.sequence
+    for axis, sample, m in evaluator.coarse.matched(base):
+        periods = sequence.periods_px(axis)
+        if sequence.find("gray", axis) or len(periods) < 2 or contradict(sequence, axis):
+            continue
+        layout, levels = axis_layout(sequence, axis), sample.levels[:, 1]
+        _, turns = fit_ripples(
+            layout,
+            [
+                phase_shift(levels, shift.indices, layout.sign, layout.offset_rad)[0]
+                for shift in layout.shifts
+            ],
+            None,
+        )
+        low, high = np.quantile(m.coordinate, [0.05, 0.95])
+        slopes = [np.polyfit(m.coordinate, each - np.rint(each), 1)[0] for each in turns]
+        grown = [
+            abs(slope) * high for slope in slopes if abs(slope) * (high - low) > limits.GROWING
+        ]
+        agreement = min(float(np.cos(2 * np.pi * each).mean()) for each in turns)
+        yield axis, agreement, max(grown, default=0.0)
+
+
 def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
     """Choose the best of all hypotheses."""
     unresolved = {*list_unresolved(evaluator, base)}
@@ -114,9 +197,12 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
         for r in sorted(_rate_all(evaluator, base), key=lambda r: -r.net)
         if r.comparison.sigmas > _least_sigmas(r, gained)
         and r.net + gained > 0
-        # a strange image misleads everywhere; edges of surfaces and beats are misread in lines
+        # what is wrong misleads everywhere; edges of surfaces and beats are misread in lines
         and (r.hypotheses[0].excluded is None or r.comparison.share > limits.MAJORITY)
         and (r.hypotheses[0].axis or not unresolved.issuperset(r.hypotheses[0].changed))
+        and (not r.hypotheses[0].axis or r.comparison.share > limits.LEAST_SHARE)
+        and _repetition(evaluator, r.hypotheses[0]) < limits.REPEATED
+        and (not r.hypotheses[0].is_of_files or r.turned <= gained)
     ]
     if not rated:
         return ()
@@ -131,19 +217,24 @@ def _list_likely(
     evaluator: Evaluator, rated: Sequence["_Rated"], gained: float
 ) -> Sequence["_Rated"]:
     """Return the best explanation, then those that account for all images about as well: one that
-    leaves none out is preferred. ``gained``: cost of the description's directions."""
+    leaves none out is preferred, and comes first where it leaves as little, as a lost image of few
+    steps fits what begins elsewhere. ``gained``: cost of the description's directions."""
     first, *others = rated
     most_left, k = first.most_left, first.hypotheses[0].excluded
     if k is not None:  # all images are compared, that one too
         left, _ = _read_left_out(evaluator, first.hypotheses[0], k)
         most_left = min(most_left, float(left.mean()) + limits.LEFT_LEAST)
-    return first, *(
+    rivals = [
         r
         for r in others
         if r.net + gained > limits.RIVAL * (first.net + gained)
         and r.comparison.left < most_left
         and not r.hypotheses[0].loses_images
-    )
+    ]
+    best = first.hypotheses[0]
+    is_seen = best.cause == "frame-lag" and bool(best.frames)  # as an image that repeats another
+    least = 0.0 if is_seen or not best.loses_images else first.comparison.left + limits.LEFT_ALIKE
+    return *(r for r in rivals if r.comparison.left < least), first, *rivals
 
 
 def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
@@ -257,13 +348,6 @@ def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") ->
     first = found.hypotheses[0]
     if first.cause != "frame-lag" or not first.frames:
         return found.hypotheses
-    sample = next(iter(evaluator.sample.by_axis.values()))
-
-    def differ(hypothesis: Hypothesis) -> float:
-        """Return the squared difference of the image that repeats from the one before it."""
-        k = hypothesis.frames[0]
-        return float(np.mean((sample.levels[k, 1] - sample.levels[k - 1, 1]) ** 2))
-
     rivals = [
         h
         for each in rated
@@ -271,7 +355,17 @@ def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") ->
         for h in each.hypotheses[:1]
         if h.cause == "frame-lag" and h.frames
     ]
-    return (min(rivals, key=differ),)
+    return (min(rivals, key=lambda h: _repetition(evaluator, h)),)
+
+
+def _repetition(evaluator: Evaluator, hypothesis: Hypothesis) -> float:
+    """Return the mean squared difference, in squares of the pixels' ranges, of the image from which
+    on all are late and the one before, which it repeats; 0 for another hypothesis."""
+    if hypothesis.cause != "frame-lag" or not hypothesis.frames:
+        return 0.0
+    sample, (k,) = next(iter(evaluator.sample.by_axis.values())), hypothesis.frames
+    squares = (sample.levels[k, 1] - sample.levels[k - 1, 1]) ** 2
+    return float(squares.mean() / np.mean(sample.swing**2))
 
 
 def _explain_by_one(
@@ -349,8 +443,14 @@ def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained:
     first = rated.hypotheses[0]
     images = [image for i in first.changed if (image := first.images[i]) is not None]
     before, after = (evaluator.residuals(h)[images] for h in (base, first))
-    if first.cause == "frame-order" and (after > limits.LEFT_OF_EACH * before).any():
+    if (
+        first.cause == "frame-order"
+        and first.frames
+        and (after > limits.LEFT_OF_EACH * before).any()
+    ):
         return False  # of two frames that have changed places, none shows what is described
+    if first.is_of_files:
+        return rated.comparison.left < limits.EXPLAINED * rated.comparison.loss
     if first.cause == "axes-swapped":
         # half of the frames of an axis fit by themselves, whatever the others show
         for axis in evaluator.sample.by_axis:
@@ -392,7 +492,7 @@ def _choose_strange(evaluator: Evaluator, rated: Sequence[_Rated]) -> Explanatio
         first = each.hypotheses[0]
         k = first.excluded
         is_rival = each.net > limits.RIVAL * best.net or each.comparison.left < best.comparison.left
-        if k is not None and is_rival:
+        if k is not None and is_rival and not _is_unpredictable(evaluator, first, k):
             residual = _measure_strangeness(evaluator, first, k)
             share = each.net / each.comparison.loss
             if residual > (0 if share > limits.STRANGE_SHARE else limits.VERY_STRANGE):

@@ -1,6 +1,8 @@
 """Findings in words: for each cause what was observed, and what to do."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from math import ceil, floor
 from typing import Any
 
@@ -8,8 +10,8 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.examination import limits
-from slviewer.examination.evaluate import Evaluator, Hypothesis, described
-from slviewer.examination.hypotheses import change_conventions, scale_finest_period
+from slviewer.examination.evaluate import Evaluator, Hypothesis, Images, described
+from slviewer.examination.hypotheses import change_conventions, change_period
 from slviewer.examination.sample import CaptureSample
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.frame_light import FrameLight, Term, list_shifts
@@ -106,9 +108,10 @@ def _try_changes(
 
 def contradict(sequence: PatternSequence, axis: Axis) -> InputError | None:
     """Return the error by which the periods and codes of an axis contradict each other or the
-    projector's size; None where they do not."""
+    projector's size; None where they do not. Plain binary numbers beside fringes are read as Gray
+    code."""
     try:
-        layout = axis_layout(sequence, axis)
+        layout = axis_layout(replace(sequence, binary=False), axis)
         if layout.shifts and not layout.numbers_periods:
             layout_levels(layout)
     except InputError as error:
@@ -141,6 +144,23 @@ def _describe_lag(hypothesis: Hypothesis) -> tuple[str, str]:
     )
 
 
+def _describe_file_order(images: Images) -> tuple[str, str]:
+    """Return observation and remedy of images that come backwards, or some of which belong behind
+    the last."""
+    first = next(k for k, image in enumerate(images) if image != k)
+    last = images[first] or 0
+    moved = (
+        f"image {first + 1} belongs"
+        if last == first + 1
+        else f"images {first + 1} to {last} belong"
+    )
+    backwards = images[0] == len(images) - 1 and images[1] == len(images) - 2
+    return (
+        "the images come in the opposite order" if backwards else f"{moved} behind the last one",
+        "name the files in the order of the patterns, or list them in the description",
+    )
+
+
 def _describe_order(hypothesis: Hypothesis, cause: Cause) -> tuple[str, str]:
     """Return observation and remedy of an order of the images."""
     frames, value = hypothesis.frames, hypothesis.value
@@ -164,6 +184,8 @@ def _describe_order(hypothesis: Hypothesis, cause: Cause) -> tuple[str, str]:
             "the phase steps do not come in the described order",
             f"number the frames so that the steps follow each other: {' and '.join(steps)}",
         )
+    elif hypothesis.is_of_files:
+        return _describe_file_order(hypothesis.images)
     elif len(numbers) == 2:
         text = f"frames {numbers[0]} and {numbers[1]} have changed places"
     elif value is not None:
@@ -220,14 +242,33 @@ def _describe_convention(
             f"the Gray code of axis {axis} begins elsewhere than described",
             [_change(text, base, axis, "gray_origin_px", f"{value:.2f}")],
         )
-    described_px = base.periods_px(axis)[-1]
-    changes = [_change("set period_px = {}", base, axis, "period_px", *_list_near(value))]
+    return _describe_period(sequence, base, axis, value)
+
+
+def _describe_period(
+    sequence: PatternSequence, base: PatternSequence, axis: Axis, value: float
+) -> tuple[str, list[_Change]]:
+    """Return observation and possible remedies of a period of ``value`` px."""
+    kept = sequence.periods_px(axis)
+    described_px = next(px for px in base.periods_px(axis) if px not in kept)
+    near = {text: float(text) for text in _list_near(value)}
+    if base.projector_size:  # mostly a whole number of fringes
+        extent = base.extent(axis)
+        count = max(1, round(extent / value))
+        if abs(np.log(extent / count / value)) < limits.WHOLE:
+            near = {f'"{extent}/{count}"': extent / count}
+    periods = dict[str, PatternSequence]()
+    for text, period in near.items():
+        with suppress(InputError):  # it is another of the periods
+            periods[text] = change_period(base, axis, described_px, period)
+    changes: list[_Change] = [("set period_px = {}", periods)]
     if base.find("gray", axis):
         cell = base.gray_cell(axis) * described_px / value
         text = "set gray_cell_px = {} if the period is right"
         changes.append(_change_cell(text, base, axis, cell))
+    which = "finest fringe period" if described_px == base.periods_px(axis)[-1] else "fringe period"
     return (
-        f"the finest fringe period of axis {axis} is {value:.3g} px, and the description says"
+        f"the {which} of axis {axis} is {value:.3g} px, and the description says"
         f" {described_px:.3g}",
         changes,
     )
@@ -243,14 +284,15 @@ def _describe_bits(
         remedy = f'describe the images in a TOML with code = "{code}", and `slviewer import frames`'
         observation = f"the bits of axis {axis} are {is_shown}, not {is_described}"
         return observation, [(remedy, {"": sequence})]
+    bits = "bits" if base.binary else "Gray bits"
     if sequence.find("gray", axis) != base.find("gray", axis):
         return (
-            f"the Gray bits of axis {axis} and their inverses have changed places",
+            f"the {bits} of axis {axis} and their inverses have changed places",
             [("exchange gray and inverse frames in the description", {"": sequence})],
         )
     order = ", ".join(str(sequence.frames[i].bit) for i in base.bits("gray", axis))
     return (
-        f"the Gray bits of axis {axis} do not have the described order",
+        f"the {bits} of axis {axis} do not have the described order",
         [(f"number them {order} (0 is the most significant)", {"": sequence})],
     )
 
@@ -278,8 +320,6 @@ def _list_near(value: float) -> list[str]:
 def _change(text: str, sequence: PatternSequence, axis: Axis, name: str, *values: str) -> _Change:
     """Return the change of one entry of a sequence to each of the values, which are in place of {}
     in the text."""
-    if name == "period_px":
-        return text, {v: scale_finest_period(sequence, axis, float(v)) for v in values}
     return text, {v: change_conventions(sequence, axis, **{name: float(v)}) for v in values}
 
 
@@ -334,14 +374,32 @@ def mirroring_remedy(of_projector: str) -> str:
     )
 
 
-def describe_reach(axis: Axis, extent: int, coordinate: np.ndarray, share: float) -> Finding:
-    """Return the finding of coordinates (p,) px of which a ``share`` lies beyond the projector."""
+def describe_reach(
+    axis: Axis, extent: int, coordinate: np.ndarray, share: float, others: Iterable[str]
+) -> Finding:
+    """Return the finding of coordinates (p,) px of which a ``share`` lies beyond the projector;
+    ``others``: remedies beside the usual one."""
     reach = float(np.quantile(coordinate, 0.995))
     text = (
         f"{100 * share:.0f} % of the {axis} codes lie outside the projector's {extent}"
         f" {LINES[axis]} and reach {reach:.0f}"
     )
-    return _find("projector-size", text, axis=axis, value=reach)
+    remedy = ", or ".join((REMEDIES["projector-size"], *others))
+    return Finding("projector-size", "rejected", text, remedy, axis=axis, value=reach)
+
+
+def describe_apart_periods(sequence: PatternSequence, axis: Axis, grown: float) -> Finding:
+    """Return the finding of coordinates by several periods whose distance grows over the projector,
+    to ``grown`` of the shorter one."""
+    periods = " and ".join(f"{px:.4g}" for px in sequence.periods_px(axis))
+    return Finding(
+        "fringe-period",
+        "rejected",
+        f"the coordinates along {axis} by the periods {periods} px drift apart over the projector,"
+        f" to {grown:.2g} fringes: one of the periods is another",
+        "correct period_px",
+        axis=axis,
+    )
 
 
 def describe_missing_pattern(sample: CaptureSample) -> Finding:

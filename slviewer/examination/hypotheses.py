@@ -25,7 +25,8 @@ MOTIONS, JUMPS = (0.1, 0.2, 0.4, 0.8, 1.6), (0.12, 0.4)
 
 def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
     """Yield the orders that cameras and projectors make: a lag, a lost image, an exchange of
-    neighbours, a frame that shows something else, and other orders of few phase steps."""
+    neighbours, a frame that shows something else, and other orders of few phase steps; and those
+    that names of files make: backwards, and with some that belong behind the last."""
     n = len(sequence.frames)
     yield from list_lags(sequence)
     kinds = [frame.kind for frame in sequence.frames]
@@ -33,13 +34,25 @@ def list_orders(sequence: PatternSequence) -> Iterator[Hypothesis]:
         exchange(sequence, k, k + 1) for k in range(n - 1) if "texture" not in kinds[k : k + 2]
     )
     for k in range(1, n):
-        shifted = _lag_from(sequence, k), _miss(sequence, k)
+        shifted = lag_from(sequence, k), _miss(sequence, k)
         yield from (hypothesis for hypothesis in shifted if _moves_several(hypothesis))
     yield from _exchange_axes(sequence)
     for k in range(n):
         images = [None if i == k else i for i in range(n)]
         yield _order("duplicate-frame", sequence, images, (k,))
     yield from _permute_steps(sequence)
+    every: list[int | None] = list(range(n))
+    yield _reorder_files(sequence, every[::-1])
+    for first in range(n):
+        # of the first ones fewer are a lag
+        for last in range(first + 4, n - 1) if first == 0 else range(first + 1, min(first + 4, n)):
+            images = every[:first] + every[last:] + every[first:last]
+            yield _reorder_files(sequence, images)
+
+
+def _reorder_files(sequence: PatternSequence, images: Sequence[int | None]) -> Hypothesis:
+    """Return the hypothesis of an order that the files' names made."""
+    return replace(_order("frame-order", sequence, images), cost=3 * CHANGE_COST)
 
 
 def list_lags(sequence: PatternSequence) -> Iterator[Hypothesis]:
@@ -90,7 +103,7 @@ def list_neighbours(hypothesis: Hypothesis) -> Iterator[Hypothesis]:
         for factor in (0.6, 0.8, 1.25, 1.6):
             px = factor * hypothesis.value
             yield _move(hypothesis.sequence, hypothesis.axis, shape, px)
-    shift = {"frame-lag": _lag_from, "missing-frame": _miss}.get(str(hypothesis.cause))
+    shift = {"frame-lag": lag_from, "missing-frame": _miss}.get(str(hypothesis.cause))
     if shift and len(hypothesis.frames) == 1:
         first = hypothesis.frames[0]
         for k in range(max(1, first - 3), min(len(hypothesis.images), first + 4)):
@@ -129,7 +142,9 @@ def recover_orders(evaluator: Evaluator, sequence: PatternSequence) -> Iterator[
             place = np.rint(turns).astype(int) % n
             steps_between = {int(d) for d in np.diff(place, append=place[:1]) % n}
             if n > 4 and len(set(place.tolist())) == n and steps_between not in ({1}, {n - 1}):
-                places[steps] = place
+                # the same for all axes, which a basis of their own turns and mirrors
+                place = (place - place[0]) % n
+                places[steps] = min(place, -place % n, key=lambda each: each.tolist())
     for n in {len(place) for place in places.values()}:
         own = {steps: place for steps, place in places.items() if len(place) == n}
         for sign in (1, -1):
@@ -138,7 +153,7 @@ def recover_orders(evaluator: Evaluator, sequence: PatternSequence) -> Iterator[
                 yield _reorder(sequence, orders)
 
 
-def _lag_from(sequence: PatternSequence, k: int) -> Hypothesis:
+def lag_from(sequence: PatternSequence, k: int) -> Hypothesis:
     """Return the hypothesis that image k repeats the one before, and later ones are late."""
     every = range(len(sequence.frames))
     return _order("frame-lag", sequence, [*every[:k], *every[k + 1 :], None], (k,), 1)
@@ -261,32 +276,36 @@ def _list_phases(
 
 
 def _scale_periods(sequence: PatternSequence, axis: Axis) -> Iterator[Hypothesis]:
-    """Yield other finest periods, up to a quarter longer or shorter, where bits or longer periods
-    contradict them; in steps that change the phase by a third of a period over the projector."""
-    bits, finest = sequence.find("gray", axis), sequence.periods_px(axis)[-1]
-    if not bits and len(sequence.periods_px(axis)) < 2:
-        return
-    extent = sequence.extent(axis) if sequence.projector_size else 64 * finest
-    count = int(np.clip(0.75 * extent / finest, 6, 60))
+    """Yield other periods, up to a quarter longer or shorter, of the finest beside bits, else of
+    any of several, which the others contradict; in steps that change the phase by a third of a
+    period over the projector, and to whole numbers of fringes."""
+    bits, periods = sequence.find("gray", axis), sequence.periods_px(axis)
     cell = {"gray_cell_px": sequence.gray_cell(axis)} if bits else {}
-    for k in (*range(-count, 0), *range(1, count + 1)):
-        period = finest * float(np.exp(0.25 * k / count))
-        try:
-            scaled = scale_finest_period(sequence, axis, period)
-        except InputError:  # it is another of the periods
-            continue
-        changed = described(change_conventions(scaled, axis, **cell))
-        yield replace(changed, cause="fringe-period", axis=axis, value=period, cost=CHANGE_COST)
+    for old in periods[-1:] if bits else periods[::-1] if len(periods) > 1 else ():
+        extent = sequence.extent(axis) if sequence.projector_size else 64 * periods[-1]
+        count = int(np.clip(0.75 * extent / old, 6, 60))
+        every = [old * float(np.exp(0.25 * k / count)) for k in range(-count, count + 1) if k]
+        if sequence.projector_size:  # mostly a whole number of fringes
+            whole = (extent / n for n in range(1, int(2 * extent / old) + 1))
+            every += [px for px in whole if 1e-4 < abs(np.log(px / old)) < 0.25]
+        for period in every:
+            try:
+                scaled = change_period(sequence, axis, old, period)
+            except InputError:  # it is another of the periods
+                continue
+            changed = described(change_conventions(scaled, axis, **cell))
+            yield replace(changed, cause="fringe-period", axis=axis, value=period, cost=CHANGE_COST)
 
 
-def scale_finest_period(sequence: PatternSequence, axis: Axis, period_px: float) -> PatternSequence:
-    """Return the sequence with another finest period of an axis. Raises InputError where it is
-    another of the periods."""
-    finest = sequence.periods_px(axis)[-1]
+def change_period(
+    sequence: PatternSequence, axis: Axis, old_px: float, period_px: float
+) -> PatternSequence:
+    """Return the sequence with another period of an axis in place of an old one. Raises InputError
+    where it is another of the periods."""
     return change_frames(
         sequence,
         axis,
-        lambda f: replace(f, period_px=period_px) if f.period_px == finest else f,
+        lambda f: replace(f, period_px=period_px) if f.period_px == old_px else f,
     )
 
 

@@ -65,6 +65,15 @@ LEAST_CONTRAST = 0.15
 SMALL_LOSS, STANDS_OUT, STANDS_OUT_LEAST = 0.03, 2.5, 0.01
 """Mean misfit, and residual of a frame over the median of its kind and squared contrast beyond it,
 up to which nothing is searched: measured, no fault that harms stays below all."""
+AGREEING = 0.3
+"""Mean cosine of the distance between two periods' coordinates, in the shorter period, below which
+something is searched for: where they agree it is 1, at random 0, and -1 for half a period."""
+GROWING, GROWN = 0.05, 0.4
+"""Growth of this distance over the view that gamma does not leave; and distance to which it grows
+from the projector's first column, at which whole periods may be wrong."""
+REPEATED = 0.06
+"""Mean squared difference, in squares of the range, up to which an image repeats another, also with
+a fifth of the next one in it; those of eight phase steps differ by 0.07, of fewer by more."""
 KEPT = 8
 """Hypotheses that are compared on all pixels, of those that the small sample ranks best."""
 SIGMAS = 5.0
@@ -75,6 +84,11 @@ deviation: a dozen pixels are needed for it to be significant."""
 MAJORITY = 0.5
 """Share of the pixels that an image which shows something else must mislead; measured, it misleads
 from 0.58, and edges of surfaces and of beats leave 0.43."""
+NARROW = 3.0
+"""Width of a cell, px of the camera, below which its bit is not predicted from its neighbours."""
+LEAST_SHARE = 0.3
+"""The same of the pixels that another description must explain better: what explains edges alone
+does so for 0.06, what is wrong for 0.6 and more."""
 SIGMAS_CONFIRMED = 3.0
 """The same of one hypothesis that other evidence asks for, one in 700 by chance: coordinates that
 run in an impossible direction, and frames' means that drift."""
@@ -97,6 +111,13 @@ LEFT_OF_RIVAL, LEFT_LEAST = 2.0, 0.01
 preferred for accounting for all images."""
 STRANGE, STRANGE_LEAST = 3.0, 0.005
 """Residual of such a frame over the median of the others, and least squared contrast of it."""
+HALF_LEFT = 0.5
+"""Share of the misfit up to which an order that loses an image is the reason of coordinates that
+cannot be."""
+WHOLE = 0.005
+"""Distance of a period, as a share, from one of a whole number of fringes across the projector."""
+LEFT_ALIKE = 0.002
+"""Misfit by which explanations are alike: a strange image among fifty leaves five times as much."""
 SIGMAS_OF_RIVAL = 3.0
 """Standard errors by which one frame that shows something else must explain all images better than
 another one."""

@@ -32,6 +32,8 @@ LEVEL_PIXELS = 4000
 """Pixels from which the agreement of several periods is estimated."""
 AGREEMENT = 0.02
 """Loss, 1 less the mean cosine of a step, of levels that agree: a scatter of 3 % of a period."""
+MOST_LOSS = 0.3
+"""Of levels that ripples bring together: a scatter of an eighth of a period. More is no gamma."""
 AMPLITUDES = np.linspace(-0.4, 0.4, 33)
 """Of ripples that are tried: a gamma of 2.2 has one of 0.29 in three steps."""
 _ARGUMENTS = np.linspace(-np.pi, np.pi, 1025)
@@ -209,8 +211,9 @@ def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
 
     Ripples (m, 1025) float32, rad, are to be added to the m wrapped phases from -pi to pi: those of
     longer periods of three or four steps, with the amplitude for which the levels agree best; (m,
-    0) where none makes them agree twice as well. Misfit, in periods: `limits.LEVEL_MISFIT`, or less
-    where the levels scatter by so much that a wrong order were as likely as 1 in 1000.
+    0) where none makes them agree, twice as well at least. Misfit, in periods:
+    `limits.LEVEL_MISFIT`, or less where the levels scatter by so much that a wrong order were as
+    likely as 1 in 1000.
     """
     layout, stack = task.layout, task.stack
     none = np.zeros((len(layout.shifts), 0), np.float32)
@@ -229,8 +232,20 @@ def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
     if len(wrapped[0]) < FEWEST or len(layout_levels(layout)) < 2:
         return none, limits.LEVEL_MISFIT
 
+    best, turns = fit_ripples(layout, wrapped, near)
+    sigma = 1.4826 * np.median(np.abs(turns - np.rint(turns)), axis=1).max()
+    return best, float(np.clip(0.5 - np.log(1000) * sigma**2, 0.02, limits.LEVEL_MISFIT))
+
+
+def fit_ripples(
+    layout: Layout, wrapped: list[np.ndarray], near: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ripples that `estimate_level_errors` describes, and with them the steps between
+    the levels (levels, p), in periods, whole where they agree; of the phases ``wrapped``, m of p
+    pixels, and the coordinates ``near`` which their Gray cells are."""
+
     def measure_turns(ripples: np.ndarray) -> np.ndarray:
-        """Return the steps (levels, p), in periods, whole where the levels agree."""
+        """Return the steps."""
         turns = unwrap(layout, add_ripples(wrapped, ripples), near)[1]
         return np.array(turns[layout.gray != () :])
 
@@ -239,7 +254,8 @@ def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
         return float(1 - np.cos(TWO_PI * measure_turns(ripples)).mean(axis=1).min())
 
     steps = [len(shift.indices) for shift in layout.shifts[:-1]]
-    best, least = none, max(measure_loss(none) / 2, AGREEMENT)
+    best = np.zeros((len(layout.shifts), 0), np.float32)
+    least = max(min(measure_loss(best) / 2, MOST_LOSS), AGREEMENT)
     for d in AMPLITUDES if least > AGREEMENT and min(steps) <= MOST_STEPS else ():
         ripples = np.zeros((len(steps) + 1, len(_ARGUMENTS)), np.float32)
         for ripple, n in zip(ripples, steps, strict=False):  # the finest has its own correction
@@ -247,9 +263,7 @@ def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
                 ripple[:] = AliasedHarmonics(n, d, d).correction(_ARGUMENTS + layout.offset_rad)
         if (loss := measure_loss(ripples)) < least:
             best, least = ripples, loss
-    turns = measure_turns(best)
-    sigma = 1.4826 * np.median(np.abs(turns - np.rint(turns)), axis=1).max()
-    return best, float(np.clip(0.5 - np.log(1000) * sigma**2, 0.02, limits.LEVEL_MISFIT))
+    return best, measure_turns(best)
 
 
 def add_ripples(wrapped: list[np.ndarray], ripples: np.ndarray) -> list[np.ndarray]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UnknownLayoutError
+from slviewer.examination.findings import REMEDIES, contradict
 from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
@@ -151,7 +152,7 @@ def import_captures(settings: ImportSettings) -> list[str]:
             progress(i / len(imports), f"reading {recording.name}")
             try:
                 capture = recording.read()
-                sequence = check_imported_capture(capture, warn).sequence
+                sequence = _check_recording(recording, capture, warn).sequence
             except InputError as error:
                 if settings.strict:
                     raise
@@ -409,6 +410,31 @@ def _centre_code(
     return centred if outside[1] < MAX_OUTSIDE < outside[0] else None
 
 
+def _check_recording(recording: ImportableRecording, capture: NewCapture, warn: Warn) -> NewCapture:
+    """`check_imported_capture`; of numbers that were read as Gray code, where they contradict their
+    description, InputError by what they themselves show; and with exchanged axes as a remedy for
+    codes that do not cover the projector, where those would."""
+    try:
+        return check_imported_capture(capture, warn)
+    except InputError as error:
+        if recording.sequence.binary != capture.sequence.binary and not capture.exposures_ms:
+            shown = recording.read(as_shown=True)
+            examination = examine_frames(shown.sequence, shown.frames, shown.files)
+            for finding in examination.rejected:
+                raise InputError(f"{shown.name}: {finding.text()}") from None
+        others: dict[Axis | None, Axis] = {"x": "y", "y": "x"}
+        own = capture.sequence
+        frames = (replace(frame, axis=others.get(frame.axis)) for frame in own.frames)
+        described, exchanged = (
+            [contradict(each, axis) is not None for axis in own.axes]
+            for each in (own, replace(own, frames=tuple(frames)))
+        )
+        if len(own.axes) == 2 and any(described) and not any(exchanged):
+            remedy = f"{error.remedy}, or {REMEDIES['axes-swapped']}"
+            raise InputError(error.observation, remedy, error.place) from None
+        raise
+
+
 def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
     """The capture with merged exposures, and with its Gray origin estimated if it was not given;
     InputError where its frames contradict its description.
@@ -471,7 +497,8 @@ def _explain_fall(sequence: PatternSequence, decoded: PhaseMap) -> str:
 def _decode_described(capture: NewCapture, warn: Warn) -> tuple[PatternSequence, PhaseMaps]:
     """Return the sequence of a capture of one exposure, and its decoded phases. Where the frames
     contradict it, and not one with the periods that its own are rounded from, these are taken: too
-    short beats, and periods of few decimals, look like other faults."""
+    short beats, and periods of few decimals, look like other faults. Raises InputError by what the
+    described periods show, or by these where the described ones cannot be decoded."""
     name, sequence, messages = capture.name, capture.sequence, list[str]()
     try:
         return sequence, decode_examined(name, sequence, capture.frames, capture.files)
@@ -485,8 +512,9 @@ def _decode_described(capture: NewCapture, warn: Warn) -> tuple[PatternSequence,
             raise
         try:
             phases = decode_examined(name, whole, capture.frames, capture.files)
-        except InputError:
-            raise error from None
+        except InputError as exact_error:
+            is_decodable = not any(contradict(sequence, axis) for axis in sequence.axes)
+            raise (error if is_decodable else exact_error) from None
     for message in messages:
         warn(message)
     return whole, phases

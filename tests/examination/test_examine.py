@@ -18,6 +18,7 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.examination import evaluate
 from slviewer.examination.examine import examine
+from slviewer.examination.hypotheses import change_period
 from slviewer.examination.light import estimate_frame_light
 from slviewer.examination.match import Match, match
 from slviewer.fringe.decode import decode
@@ -156,6 +157,49 @@ def test_frames_that_are_all_early_are_named(name: str) -> None:
     sequence, frames = captured(name)
     found = examine(sequence, early(frames)).rejected
     assert [(f.cause, f.value) for f in found] == [("frame-lag", -1.0)]
+
+
+@pytest.mark.parametrize("name", variants(SEQUENCES, "multifrequency"))
+def test_images_in_the_opposite_order_are_named(name: str) -> None:
+    sequence, frames = captured(name)
+    found = root(sequence, frames[::-1])
+    assert found.cause in ("frame-order", "step-order"), found
+    assert "opposite" in found.observation
+
+
+@pytest.mark.parametrize("name", variants(SEQUENCES, "p18"))
+def test_images_that_belong_behind_the_last_are_named(name: str) -> None:
+    """As names of several digits sort, f9 before f10 before fa."""
+    sequence, frames = captured(name)
+    moved = frames[[*range(10), len(frames) - 1, *range(10, len(frames) - 1)]]
+    assert root(sequence, moved).observation == "image 11 belongs behind the last one"
+
+
+def select_axis(name: str, axis: str) -> Capture:
+    """One axis of a capture."""
+    sequence, frames = captured(name)
+    chosen = [i for i, frame in enumerate(sequence.frames) if frame.axis in (axis, None)]
+    own = tuple(sequence.frames[i] for i in chosen)
+    return replace(sequence, frames=own), frames[chosen]
+
+
+@pytest.mark.parametrize("name", variants(STEPS_AND_CODE, "p18"))
+def test_the_other_sign_is_named_on_one_axis(name: str) -> None:
+    """Mirrored within its fringe, every pixel fits: its neighbours tell."""
+    sequence, frames = select_axis(name, "x")
+    assert causes(sequence, frames) == []
+    found = root(replace(sequence, phase_sign=-sequence.sign("x")), frames)
+    assert found.cause == "step-order" and "phase_sign = 1" in found.remedy
+
+
+@pytest.mark.parametrize("factor", [1.13, 0.93])
+def test_a_wrong_long_period_is_named(factor: float) -> None:
+    """It puts whole fringes off, and leaves next to nothing of the images."""
+    sequence, frames = select_axis("multifrequency", "x")
+    long = sequence.periods_px("x")[0]
+    wrong = change_period(sequence, "x", long, factor * long)
+    assert causes(sequence, frames) == []
+    assert causes(wrong, frames) == [("fringe-period", "x")]
 
 
 EXCHANGED = [("p18", 4), ("gray", 24), ("complementary", 5), ("multifrequency", 20)]

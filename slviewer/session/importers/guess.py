@@ -432,6 +432,8 @@ def _list_cells(parts: _AxisBlocks) -> list[float]:
     assert parts.code is not None
     bits = parts.code.bits
     b, bit = [(b, bit) for b, bit in enumerate(bits) if bit.is_readable and bit.even is None][-1]
+    if not max(bit.edges):
+        return []
     cell = 1 / (2.0 ** (len(bits) - b) * max(bit.edges))  # two cells from edge to edge of the last
     turns = cell * _compute_fringe_frequency(parts.runs[-1]) / TURN
     count = int(np.clip(3 * 2 ** len(bits) * turns * CELL_ERROR, 4, 40))

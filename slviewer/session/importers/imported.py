@@ -47,16 +47,17 @@ class ImportableRecording:
         second = None if self.second is None else self.second.read_channel(channel)
         return replace(self, channel=channel, second=second)
 
-    def read(self) -> NewCapture:
+    def read(self, as_shown: bool = False) -> NewCapture:
         """The capture with its frames; InputError where an image cannot be used.
-        `settings["channel"]` states which channel of colour frames was taken."""
-        capture = self._read_own()
-        if self.second is None:
+        `settings["channel"]` states which channel of colour frames was taken. ``as_shown``: without
+        a second camera, and with plain binary numbers beside phase steps as they are."""
+        capture = self._read_own(as_shown)
+        if self.second is None or as_shown:
             return capture
         second = replace(self.second._read_own(), sequence=capture.sequence, texture=None)
         return replace(capture, second=second)
 
-    def _read_own(self) -> NewCapture:
+    def _read_own(self, as_shown: bool = False) -> NewCapture:
         """The capture without what a second camera saw."""
         channel = self.channel or DEFAULT_CHANNEL
         kinds = [frame.kind for frame in self.sequence.frames]
@@ -67,7 +68,7 @@ class ImportableRecording:
         images = read_frames(self.files, colour_frame, channel, self.sequence.full_scale)
         settings = {**self.settings, "channel": channel} if images.in_colour else self.settings
         sequence, stack = replace(self.sequence, full_scale=images.full_scale), images.stack
-        if has_binary_beside_phase(sequence):
+        if has_binary_beside_phase(sequence) and not as_shown:
             sequence, stack = to_gray_code(sequence, stack)
         files = [
             file.relative_to(self.source) if file.is_relative_to(self.source) else file
