@@ -30,6 +30,7 @@ from slviewer.examination.ghost import has_ghost
 from slviewer.examination.hypotheses import list_descriptions
 from slviewer.examination.light import Look, equalize_samples, look_at
 from slviewer.examination.motion import is_displaced, measure_motion
+from slviewer.examination.sample import CaptureSample
 from slviewer.fringe.aliased_harmonics import MOST_STEPS, estimate_aliased_harmonics
 from slviewer.fringe.decoding_task import prepare_decoding
 from slviewer.fringe.frame_light import FrameLight
@@ -59,10 +60,8 @@ def _judge(
 ) -> Sequence[Finding]:
     """Return the findings of a capture whose light has been estimated."""
     sequence, sample = base.sequence, evaluator.sample
-    if not sample.is_usable and (sample.by_axis or sample.lit < limits.LEAST_LIT):
-        return [describe_missing_pattern(sample)]
-    if too_few := [*_judge_few_periods(sequence)]:
-        return too_few
+    if too_little := [*_judge_pattern(sequence, sample)]:
+        return too_little
     ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
     found = explain(evaluator, base, bool(motion))
     coordinates = [*_judge_coordinates(evaluator, base)]
@@ -75,15 +74,18 @@ def _judge(
     if motion and not ghost and not coordinates:
         return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
     judged = [*_judge_readability(evaluator, base), *coordinates]
-    if not judged and not ghost:
-        judged = [
-            describe_apart_periods(sequence, axis, grown)
-            for axis, _, grown in measure_levels(evaluator, base)
-            if grown > limits.GROWN
-        ]
     if ghost:  # it imitates other light
         return [*judged, describe_ghost(ghost)]
-    return [*judged, *(_judge_light(sequence, stack, light) if not coordinates else ())]
+    if not coordinates:
+        judged += [*_judge_periods(evaluator, base), *_judge_light(sequence, stack, light)]
+    return judged
+
+
+def _judge_periods(evaluator: Evaluator, base: Hypothesis) -> Iterator[Finding]:
+    """Yield the finding of an axis of which one of several periods is another."""
+    for axis, _, grown in measure_levels(evaluator, base):
+        if grown > limits.GROWN:
+            yield describe_apart_periods(base.sequence, axis, grown)
 
 
 def _explains_little(evaluator: Evaluator, base: Hypothesis, found: Hypothesis) -> bool:
@@ -94,9 +96,12 @@ def _explains_little(evaluator: Evaluator, base: Hypothesis, found: Hypothesis) 
     return change.left > limits.HALF_LEFT * change.loss
 
 
-def _judge_few_periods(sequence: PatternSequence) -> Iterator[Finding]:
-    """Yield the finding of an axis whose one fringe period does not number the projector: what fits
-    its images best is not known then."""
+def _judge_pattern(sequence: PatternSequence, sample: CaptureSample) -> Iterator[Finding]:
+    """Yield the finding of images without pattern, else of an axis whose one fringe period does not
+    number the projector: what fits its images best is not known then."""
+    if not sample.is_usable and (sample.by_axis or sample.lit < limits.LEAST_LIT):
+        yield describe_missing_pattern(sample)
+        return
     for axis in sequence.axes if sequence.projector_size else ():
         is_single = len(sequence.periods_px(axis)) == 1 and not sequence.find("gray", axis)
         error = contradict(sequence, axis) if is_single else None

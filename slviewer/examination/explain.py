@@ -49,14 +49,21 @@ def explain(evaluator: Evaluator, base: Hypothesis, has_motion: bool = False) ->
                 explained = _rate(evaluator, base, found)
                 if _rate(evaluator, base, (others,)).comparison.left < explained.most_left:
                     return tuple(_repeat(base.sequence, *pair) for pair in copies)
+    repeated = _explain_repetition(evaluator, base, found)
+    return repeated or found or tuple(_explain_single_images(evaluator, base))
+
+
+def _explain_repetition(evaluator: Evaluator, base: Hypothesis, found: Explanation) -> Explanation:
+    """Return that an image repeats the one before, and those behind it are late or not; empty where
+    there is none, or what was ``found`` is about that image."""
     k = _find_repetition(evaluator, base)
-    if k is not None and not any(k in each.frames for each in found):
-        without = tuple(None if i == k else i for i in base.images)
-        others, late = replace(base, images=without), lag_from(base.sequence, k)
-        left, left_late = (evaluator.compare(base, each).left for each in (others, late))
-        is_late = len(late.changed) > 1 and left_late < left
-        return (late if is_late else _repeat(base.sequence, k, k - 1),)
-    return found or tuple(_explain_single_images(evaluator, base))
+    if k is None or any(k in each.frames for each in found):
+        return ()
+    without = tuple(None if i == k else i for i in base.images)
+    others, late = replace(base, images=without), lag_from(base.sequence, k)
+    left, left_late = (evaluator.compare(base, each).left for each in (others, late))
+    is_late = len(late.changed) > 1 and left_late < left
+    return (late if is_late else _repeat(base.sequence, k, k - 1),)
 
 
 def _find_repetition(evaluator: Evaluator, base: Hypothesis) -> int | None:
@@ -195,14 +202,8 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
     rated = [
         r
         for r in sorted(_rate_all(evaluator, base), key=lambda r: -r.net)
-        if r.comparison.sigmas > _least_sigmas(r, gained)
-        and r.net + gained > 0
-        # what is wrong misleads everywhere; edges of surfaces and beats are misread in lines
-        and (r.hypotheses[0].excluded is None or r.comparison.share > limits.MAJORITY)
+        if _is_possible(evaluator, r, gained)
         and (r.hypotheses[0].axis or not unresolved.issuperset(r.hypotheses[0].changed))
-        and (not r.hypotheses[0].axis or r.comparison.share > limits.LEAST_SHARE)
-        and _repetition(evaluator, r.hypotheses[0]) < limits.REPEATED
-        and (not r.hypotheses[0].is_of_files or r.turned <= gained)
     ]
     if not rated:
         return ()
@@ -211,6 +212,22 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
         if not is_single and _is_explained(evaluator, base, each, gained):
             return _explain_by_one(evaluator, rated, each) or _locate(evaluator, rated, each)
     return () if rated[0].hypotheses[0].excluded is None else _choose_strange(evaluator, rated)
+
+
+def _is_possible(evaluator: Evaluator, rated: "_Rated", gained: float) -> bool:
+    """Return whether an explanation is significant, and is not contradicted: what is wrong misleads
+    everywhere, edges of surfaces and beats are misread in lines. ``gained``: cost of the
+    description's directions."""
+    first, share = rated.hypotheses[0], rated.comparison.share
+    if first.excluded is not None and share <= limits.MAJORITY:
+        return False
+    if first.axis and share <= limits.LEAST_SHARE:
+        return False
+    if first.is_of_files and rated.turned > gained:
+        return False
+    is_significant = rated.comparison.sigmas > _least_sigmas(rated, gained)
+    is_repeating = _repetition(evaluator, first) < limits.REPEATED
+    return is_significant and rated.net + gained > 0 and is_repeating
 
 
 def _list_likely(
@@ -403,11 +420,14 @@ class _Rated:
 
 
 def _least_sigmas(rated: _Rated, gained: float) -> float:
-    """Return the significance that an explanation needs: less where it gives coordinates that rise
-    in a possible direction, and the description, whose directions cost ``gained``, does not."""
+    """Return the significance that an explanation needs: less where nearly all pixels agree, and
+    where it gives coordinates that rise in a possible direction, and the description, whose
+    directions cost ``gained``, does not."""
     is_impossible = gained >= min(limits.MIRRORED_COST, limits.FOLDED_COST)
     is_possible = rated.turned < gained
-    return limits.SIGMAS_CONFIRMED if is_impossible and is_possible else limits.SIGMAS
+    is_shared = rated.comparison.share > limits.NEARLY_ALL
+    is_confirmed = is_shared or (is_impossible and is_possible)
+    return limits.SIGMAS_CONFIRMED if is_confirmed else limits.SIGMAS
 
 
 def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _Rated:
@@ -699,8 +719,8 @@ def _list_pairs(
     kinds = base.sequence.frames
     chosen = sorted(i for i in {*alone, *worst.tolist()} if kinds[i].kind != "texture")
     for a, b in combinations(chosen, 2):
-        if b > a + 1:
-            yield exchange(base.sequence, a, b)
+        if b > a + 1:  # less likely than another convention
+            yield replace(exchange(base.sequence, a, b), cost=1.5 * limits.CHANGE_COST)
 
 
 def _rank(

@@ -161,6 +161,15 @@ def _describe_file_order(images: Images) -> tuple[str, str]:
     )
 
 
+def _describe_exchange(sequence: PatternSequence, frames: Sequence[int]) -> tuple[str, str]:
+    """Return observation and remedy of two frames that have changed places."""
+    text = f"frames {frames[0] + 1} and {frames[1] + 1} have changed places"
+    remedy, axis = REMEDIES["frame-order"], sequence.frames[frames[0]].axis
+    if axis and {*(_find_reversing_pair(sequence, axis) or ())} == {*frames}:
+        remedy += f", or set phase_sign = {-sequence.sign(axis)} for axis {axis}"
+    return text, remedy
+
+
 def _describe_order(hypothesis: Hypothesis, cause: Cause) -> tuple[str, str]:
     """Return observation and remedy of an order of the images."""
     frames, value = hypothesis.frames, hypothesis.value
@@ -187,7 +196,7 @@ def _describe_order(hypothesis: Hypothesis, cause: Cause) -> tuple[str, str]:
     elif hypothesis.is_of_files:
         return _describe_file_order(hypothesis.images)
     elif len(numbers) == 2:
-        text = f"frames {numbers[0]} and {numbers[1]} have changed places"
+        return _describe_exchange(hypothesis.sequence, frames)
     elif value is not None:
         late = "late or repeated" if value < frames[0] else "too early"
         text = f"frame {numbers[0]} shows the pattern of frame {int(value) + 1}: it is {late}"
@@ -221,6 +230,8 @@ def _describe_convention(
     if cause == "step-order":
         also = f" and phase_offset = {offset:.3f}" if abs(turns) > 1e-6 else ""
         order = ", or number the steps backwards" if also else ""
+        if (pair := _find_reversing_pair(base, axis)) and not also:
+            order = f", or exchange images {pair[0] + 1} and {pair[1] + 1}"
         text = f"set phase_sign = {sequence.sign(axis)}{also} for axis {axis}{order}"
         return (
             f"the fringes of axis {axis} shift in the opposite direction to the description",
@@ -243,6 +254,16 @@ def _describe_convention(
             [_change(text, base, axis, "gray_origin_px", f"{value:.2f}")],
         )
     return _describe_period(sequence, base, axis, value)
+
+
+def _find_reversing_pair(sequence: PatternSequence, axis: Axis) -> tuple[int, int] | None:
+    """Return the frames of the one phase shift of an axis, of three or four steps, whose exchange
+    is the other sign of the phase; None where there is none."""
+    shifts = sequence.phase_shifts(axis)
+    if len(shifts) != 1 or len(shifts[0][1]) > 4:
+        return None
+    _, second, *_, last = shifts[0][1]
+    return second, last
 
 
 def _describe_period(

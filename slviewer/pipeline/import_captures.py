@@ -411,17 +411,17 @@ def _centre_code(
 
 
 def _check_recording(recording: ImportableRecording, capture: NewCapture, warn: Warn) -> NewCapture:
-    """`check_imported_capture`; of numbers that were read as Gray code, where they contradict their
-    description, InputError by what they themselves show; and with exchanged axes as a remedy for
-    codes that do not cover the projector, where those would."""
+    """`check_imported_capture`; InputError, too, where numbers that are read as Gray code
+    contradict their description, and with exchanged axes as a remedy for codes that do not cover
+    the projector, where those would."""
+    if recording.sequence.binary != capture.sequence.binary and not capture.exposures_ms:
+        shown = recording.read(as_shown=True)
+        examination = examine_frames(shown.sequence, shown.frames, shown.files)
+        for finding in examination.rejected:
+            raise InputError(f"{shown.name}: {finding.text()}")
     try:
         return check_imported_capture(capture, warn)
     except InputError as error:
-        if recording.sequence.binary != capture.sequence.binary and not capture.exposures_ms:
-            shown = recording.read(as_shown=True)
-            examination = examine_frames(shown.sequence, shown.frames, shown.files)
-            for finding in examination.rejected:
-                raise InputError(f"{shown.name}: {finding.text()}") from None
         others: dict[Axis | None, Axis] = {"x": "y", "y": "x"}
         own = capture.sequence
         frames = (replace(frame, axis=others.get(frame.axis)) for frame in own.frames)
