@@ -185,8 +185,10 @@ class Evaluator:
         chance = np.sqrt(2 * np.mean(np.minimum(gain, 0) ** 2))
         error = max(float(chance), float(gain.std()) / limits.MOST_SKEWED) / np.sqrt(len(gain))
         every = np.concatenate(losses)
-        sigmas, share = mean / (error + 1e-9), np.mean(gain > 0) / max(np.mean(gain != 0), 1e-9)
-        return MisfitChange(float(every.mean()) if every.size else 1.0, mean, sigmas, float(share))
+        sigmas, changed = mean / (error + 1e-9), max(float(np.mean(gain != 0)), 1e-9)
+        share, breadth = (float(np.mean(gain > least)) / changed for least in (0.0, 0.1 * mean))
+        left = float(every.mean()) if every.size else 1.0
+        return MisfitChange(left, mean, float(sigmas), share, breadth)
 
     def residuals(self, hypothesis: Hypothesis) -> np.ndarray:
         """Return the mean squared residual (n,) of each image in squares of the pattern's contrast,
@@ -275,13 +277,14 @@ class MisfitChange:
 
     ``loss``: mean share of the images' variance that the other leaves; ``gain``: by how much less
     the first leaves; ``sigmas``: the gain in standard errors; ``share``: of the pixels that it
-    changes, those that it explains better.
+    changes, those that it explains better, and ``breadth`` by a tenth of the mean gain.
     """
 
     loss: float
     gain: float
     sigmas: float
     share: float
+    breadth: float
 
     @property
     def left(self) -> float:

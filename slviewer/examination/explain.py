@@ -218,14 +218,15 @@ def _is_possible(evaluator: Evaluator, rated: "_Rated", gained: float) -> bool:
     """Return whether an explanation is significant, and is not contradicted: what is wrong misleads
     everywhere, edges of surfaces and beats are misread in lines. ``gained``: cost of the
     description's directions."""
-    first, share = rated.hypotheses[0], rated.comparison.share
-    if first.excluded is not None and share <= limits.MAJORITY:
+    first, change = rated.hypotheses[0], rated.comparison
+    is_wide = change.share > limits.MAJORITY and change.breadth > limits.LEAST_SHARE
+    if first.excluded is not None and not is_wide:
         return False
-    if first.axis and share <= limits.LEAST_SHARE:
+    if first.axis and change.share <= limits.LEAST_SHARE:
         return False
     if first.is_of_files and rated.turned > gained:
         return False
-    is_significant = rated.comparison.sigmas > _least_sigmas(rated, gained)
+    is_significant = change.sigmas > _least_sigmas(rated, gained)
     is_repeating = _repetition(evaluator, first) < limits.REPEATED
     return is_significant and rated.net + gained > 0 and is_repeating
 
@@ -435,7 +436,8 @@ def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _R
     each = [evaluator.compare(base, h) for h in hypotheses]
     gain = sum(c.gain for c in each)
     sigmas, share = min(c.sigmas for c in each), min(c.share for c in each)
-    comparison = MisfitChange(each[0].loss, gain, sigmas, share)
+    breadth = min(c.breadth for c in each)
+    comparison = MisfitChange(each[0].loss, gain, sigmas, share, breadth)
     turned = _turned(evaluator, hypotheses)
     net = gain - sum(h.cost for h in hypotheses) - turned
     return _Rated(hypotheses, comparison, net, turned)

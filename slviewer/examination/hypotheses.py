@@ -121,7 +121,11 @@ def exchange(sequence: PatternSequence, a: int, b: int) -> Hypothesis:
     hypothesis = _order("frame-order", sequence, images, (a, b))
     # in three or four steps that is the other sign of the phase as well
     is_reversal = is_reversal and first.steps <= 4
-    return replace(hypothesis, cost=4 * CHANGE_COST) if is_reversal else hypothesis
+    if is_reversal:
+        return replace(hypothesis, cost=4 * CHANGE_COST)
+    # a bit and its inverse count backwards, as the other sign does
+    is_inversion = {first.kind, second.kind} == {"gray", "inverse"} and first.bit == second.bit
+    return replace(hypothesis, cost=1.5 * CHANGE_COST) if is_inversion else hypothesis
 
 
 def recover_orders(evaluator: Evaluator, sequence: PatternSequence) -> Iterator[Hypothesis]:

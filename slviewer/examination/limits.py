@@ -81,14 +81,14 @@ SIGMAS = 5.0
 MOST_SKEWED = 1.5
 """Factor by which the error of a gain that only a part of the pixels show is smaller than by their
 deviation: a dozen pixels are needed for it to be significant."""
-MAJORITY = 0.55
+MAJORITY = 0.5
 """Share of the pixels that an image which shows something else must mislead; measured, it misleads
-from 0.58, and edges of surfaces and of beats leave up to 0.5."""
+from 0.58, and edges of surfaces and of beats leave 0.43."""
 NARROW = 3.0
 """Width of a cell, px of the camera, below which its bit is not predicted from its neighbours."""
 LEAST_SHARE = 0.3
-"""The same of the pixels that another description must explain better: what explains edges alone
-does so for 0.06, what is wrong for 0.6 and more."""
+"""The same of the pixels that another description must explain better, and a strange image by a
+tenth of the mean: what explains edges alone does so for 0.06, what is wrong for 0.6 and more."""
 SIGMAS_CONFIRMED, NEARLY_ALL = 3.0, 0.9
 """The same of one hypothesis that other evidence asks for, one in 700 by chance: coordinates that
 run in an impossible direction, frames' means that drift, and such a share of the pixels."""
