@@ -57,6 +57,11 @@ class Hypothesis:
         return self.cause == "frame-order" and not self.frames
 
     @property
+    def is_late(self) -> bool:
+        """Whether all images are late, or early."""
+        return self.cause == "frame-lag" and not self.frames
+
+    @property
     def loses_images(self) -> bool:
         """Whether no image shows one of the pattern frames."""
         return any(self.images[i] is None for i in self.changed)

@@ -55,13 +55,15 @@ def explain(evaluator: Evaluator, base: Hypothesis, has_motion: bool = False) ->
 
 def _explain_repetition(evaluator: Evaluator, base: Hypothesis, found: Explanation) -> Explanation:
     """Return that an image repeats the one before, and those behind it are late or not; empty where
-    there is none, or what was ``found`` is about that image."""
+    there is none, or what was ``found`` is about that image, or explains more."""
     k = _find_repetition(evaluator, base)
     if k is None or any(k in each.frames for each in found):
         return ()
     without = tuple(None if i == k else i for i in base.images)
     others, late = replace(base, images=without), lag_from(base.sequence, k)
     left, left_late = (evaluator.compare(base, each).left for each in (others, late))
+    if found and _rate(evaluator, base, found).comparison.left < min(left, left_late):
+        return ()
     is_late = len(late.changed) > 1 and left_late < left
     return (late if is_late else _repeat(base.sequence, k, k - 1),)
 
@@ -252,7 +254,11 @@ def _list_likely(
     best = first.hypotheses[0]
     is_seen = best.cause == "frame-lag" and bool(best.frames)  # as an image that repeats another
     least = 0.0 if is_seen or not best.loses_images else first.comparison.left + limits.LEFT_ALIKE
-    return *(r for r in rivals if r.comparison.left < least), first, *rivals
+    whole = [r for r in rivals if r.comparison.left < least and not r.hypotheses[0].is_of_files]
+    if best.is_of_files:  # cameras are late more often than names are out of order
+        alike = first.comparison.left + limits.LEFT_ALIKE
+        whole = [r for r in others if r.hypotheses[0].is_late and r.comparison.left < alike]
+    return *whole, first, *rivals
 
 
 def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
@@ -484,8 +490,9 @@ def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained:
         return rated.net > limits.EXPLAINED_BY_MOTION * rated.comparison.loss
     if rated.net + gained > limits.EXPLAINED * rated.comparison.loss:
         return True
-    is_less = np.nansum(after) < limits.LEFT_OF_FRAMES * np.nansum(before)
-    return len(rated.hypotheses) == 1 and bool(is_less)
+    if len(rated.hypotheses) > 1 or rated.comparison.left > limits.UNREADABLE:
+        return False
+    return bool(np.nansum(after) < limits.LEFT_OF_FRAMES * np.nansum(before))
 
 
 class _Ranked(NamedTuple):
