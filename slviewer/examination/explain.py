@@ -73,15 +73,16 @@ def _find_repetition(evaluator: Evaluator, base: Hypothesis) -> int | None:
     patterns differ; None where there is none: noise makes two images of anything unlike."""
     repeated = list[int]()
     for axis, sample, m in evaluator.matched(base):
+        levels, places = sample.levels[:, 1], {image: i for i, image in enumerate(m.images)}
+        pairs = [k for k in places if k - 1 in places and np.array_equal(levels[k], levels[k - 1])]
+        if not pairs:
+            continue
         low, high = np.quantile(m.coordinate, [0.05, 0.95])
         seen = np.linspace(low, high, len(m.coordinate))  # the match takes up what fine bits show
         shown = evaluator.atoms(base, axis).at(seen)[m.places]
-        patterns = dict(zip(m.images, shown, strict=True))
-        levels = sample.levels[:, 1]
-        for k in patterns.keys() & {i + 1 for i in patterns}:
-            differs = np.abs(patterns[k] - patterns[k - 1]).mean() > limits.FLAT
-            if differs and np.array_equal(levels[k], levels[k - 1]):
-                repeated.append(k)
+        repeated += [
+            k for k in pairs if np.abs(shown[places[k]] - shown[places[k - 1]]).mean() > limits.FLAT
+        ]
     return min(repeated, default=None)
 
 
