@@ -212,7 +212,7 @@ def rendered(tmp_path: Path) -> Path:
         ({"full_scale": 1023}, "1023"),
         ({"frames": (SHOWN.frames[1], SHOWN.frames[0], *SHOWN.frames[2:])}, "shot01"),
         # of three bits it is the same whether their numbers are reversed or two files exchanged
-        ({"frames": (*SHOWN.frames[:6], *SHOWN.frames[:5:-1])}, "shot08"),
+        ({"frames": (*SHOWN.frames[:6], *SHOWN.frames[:5:-1])}, "number them 2, 1, 0"),
         ({"frames": (*SHOWN.frames[:2], *phase_steps("x", 4, 6), *SHOWN.frames[6:])}, "period"),
     ],
     ids=["right", "sign", "offset", "origin", "full scale", "white", "bits", "period"],
