@@ -192,8 +192,8 @@ class Evaluator:
         every = np.concatenate(losses)
         sigmas, changed = mean / (error + 1e-9), max(float(np.mean(gain != 0)), 1e-9)
         share, breadth = (float(np.mean(gain > least)) / changed for least in (0.0, 0.1 * mean))
-        left = float(every.mean()) if every.size else 1.0
-        return MisfitChange(left, mean, float(sigmas), share, breadth)
+        lost = float(every.mean()) if every.size else 1.0
+        return MisfitChange(lost, mean, float(sigmas), share, breadth)
 
     def residuals(self, hypothesis: Hypothesis) -> np.ndarray:
         """Return the mean squared residual (n,) of each image in squares of the pattern's contrast,

@@ -33,7 +33,7 @@ LEVEL_PIXELS = 4000
 AGREEMENT = 0.02
 """Loss, 1 less the mean cosine of a step, of levels that agree: a scatter of 3 % of a period."""
 MOST_LOSS = 0.3
-"""Of levels that ripples bring together: a scatter of an eighth of a period. More is no gamma."""
+"""Loss up to which ripples account for levels: a scatter of an eighth of a period."""
 AMPLITUDES = np.linspace(-0.4, 0.4, 33)
 """Of ripples that are tried: a gamma of 2.2 has one of 0.29 in three steps."""
 _ARGUMENTS = np.linspace(-np.pi, np.pi, 1025)

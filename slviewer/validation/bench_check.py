@@ -41,7 +41,7 @@ LIMITS = {
     "decode, whole / kernel": 3.3,
     "examine a capture / kernel": 4.6,
     "noise and fringe mean, sampled / kernel": 0.32,
-    "second pass, over spikes / kernel": 0.36,
+    "second pass, over spikes / kernel": 0.29,
     "one pass, pixelwise / floor": 3.3,
     "write points as PLY / floor": 4.5,
     "reconstruct again in the process / kernel": 86.0,
