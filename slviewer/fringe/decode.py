@@ -106,11 +106,12 @@ def _allocate_maps(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
 def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> None:
     """Move phases that were read on the wrong side of a code edge, and mask those without support,
     in place."""
-    rules, lists = spike_rules(layout), kernels_spikes.allocate_lists(phase.shape)
+    rules, marks = spike_rules(layout), kernels_spikes.allocate_marks(phase.shape)
+    lists = kernels_spikes.allocate_lists(phase.shape)
     if rules.is_plain:
-        kernels_spikes.list_changes(phase, rules, False, *lists)
-        kernels_spikes.move_phases(*lists, phase)
-    kernels_spikes.list_changes(phase, rules, True, *lists)
+        kernels_spikes.list_changes(phase, rules, False, marks, *lists)
+        kernels_spikes.move_phases(*lists, phase, marks)
+    kernels_spikes.list_changes(phase, rules, True, marks, *lists)
     kernels_spikes.mask_phases(*lists, phase, reason)
 
 

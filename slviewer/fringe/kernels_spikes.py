@@ -4,7 +4,7 @@ apply it to a map.
 The rule is also compiled for CUDA devices (`geometry.cuda_device.device_function`);
 `tests/decode_reference.py` defines it. All changes are listed before the first is made, because a
 pixel's neighbours vote with their original phase. Nearly every pixel agrees with its four
-neighbours, and is skipped at the speed of memory.
+neighbours, and is skipped at the speed of memory; the others are marked once, for both lists.
 """
 
 import math
@@ -179,10 +179,17 @@ def allocate_lists(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.n
     return np.empty(shape, np.uint16), np.empty(shape, np.uint8), np.empty(shape[0], np.int64)
 
 
+def allocate_marks(shape: tuple[int, int]) -> np.ndarray:
+    """Allocate the marks (h, ceil(w / RUN)) of a map (h, w): a byte for each pixel that is examined,
+    zero beyond the last."""
+    return np.zeros((shape[0], -(-shape[1] // RUN)), np.uint64)
+
+
 def list_changes(
     phase: np.ndarray,
     rules: SpikeRules,
     masking: bool,
+    marks: np.ndarray,
     columns: np.ndarray,
     words: np.ndarray,
     counts: np.ndarray,
@@ -191,41 +198,37 @@ def list_changes(
     ``columns[v]``.
 
     ``masking``: pixels to mask, ``words[v]`` being their reasons; else those to be moved by a
-    period, UP or DOWN.
+    period, UP or DOWN. A plain code's are moved first: ``marks`` is written then, kept by
+    `move_phases`, and read when masking.
     """
-    run_rows(_list_rows, phase.shape[0], phase, rules, masking, columns, words, counts)
+    run_rows(_list_rows, phase.shape[0], phase, rules, masking, marks, columns, words, counts)
 
 
 @kernel()
-def _list_rows(start, stop, phase, rules, masking, columns, words, counts):
+def _list_rows(start, stop, phase, rules, masking, marks, columns, words, counts):
     """List the changes of a range of rows, see `list_changes`."""
-    runs = np.zeros(-(-phase.shape[1] // RUN), np.uint64)
+    per_cell = np.float32(1 / rules.cell_rad)
+    low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
     for row in range(start, stop):
-        counts[row] = _list_row(phase, row, rules, masking, columns[row], words[row], runs)
+        if not (masking and rules.is_plain):
+            _mark_examined(phase, row, per_cell, low, high, marks[row].view(np.uint8))
+        counts[row] = _list_row(phase, row, rules, masking, marks[row], columns[row], words[row])
 
 
 @numba.njit
-def _list_row(phase, row, rules, masking, columns, words, runs):
-    """List the changes of one row and return their number.
-
-    Fills ``columns`` and ``words``; ``runs`` is a buffer of a byte for each pixel, zero beyond the
-    last.
-    """
-    width, per_cell, examined = phase.shape[1], np.float32(1 / rules.cell_rad), runs.view(np.uint8)
-    low = np.float32(rules.low_rad if masking else -math.inf)
-    high = np.float32(rules.high_rad if masking else math.inf)
-    _mark_examined(phase, row, per_cell, low, high, examined)
-    count = 0
+def _list_row(phase, row, rules, masking, runs, columns, words):
+    """List the changes among the marked pixels of one row in ``columns`` and ``words``; return
+    their number."""
+    per_cell, examined, count = np.float32(1 / rules.cell_rad), runs.view(np.uint8), 0
     for run in range(len(runs)):
         if runs[run] == 0:
             continue
-        for x in range(RUN * run, min(RUN * run + RUN, width)):
+        for x in range(RUN * run, min(RUN * run + RUN, phase.shape[1])):
             if examined[x]:
+                word, suspect = UNCHANGED, is_suspect(phase, row, x, per_cell)
                 if masking:
-                    is_inside = phase[row, x] >= low and phase[row, x] <= high
-                    suspect = is_inside or is_suspect(phase, row, x, per_cell)
                     word = masking_reason(phase, row, x, suspect, rules)
-                else:
+                elif suspect:
                     word = period_change(phase, row, x, rules)
                 if word != UNCHANGED:
                     columns[count], words[count] = x, word
@@ -256,11 +259,17 @@ def _mark_examined(phase, row, per_cell, low, high, examined):
 
 
 @kernel()
-def move_phases(columns, words, counts, phase):
-    """Move the listed phases by a period, in place."""
+def move_phases(columns, words, counts, phase, marks):
+    """Move the listed phases by a period, in place, and mark their neighbours, which may no longer
+    agree."""
+    examined, (height, width) = marks.view(np.uint8), phase.shape
     for row in range(len(counts)):
         for i in range(counts[row]):
-            phase[row, columns[row, i]] += TURN if words[row, i] == UP else -TURN
+            x = columns[row, i]
+            phase[row, x] += TURN if words[row, i] == UP else -TURN
+            for v in range(max(0, row - 1), min(height, row + 2)):
+                for u in range(max(0, x - 1), min(width, x + 2)):
+                    examined[v, u] = phase[v, u] == phase[v, u]  # not NaN
 
 
 @kernel()

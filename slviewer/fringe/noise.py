@@ -55,7 +55,8 @@ def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[floa
         )
     if not any(len(each.levels) for each in bins):
         frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
-        indices = tuple(i for i in frames if i is not None)
+        # without either, the bit of the fewest edges
+        indices = tuple(i for i in frames if i is not None) or layout.gray[:1] + layout.inverse[:1]
         bins = [
             _measure_difference_noise(sample(s, indices), white)
             for s in (stack, stack.transpose(0, 2, 1))

@@ -94,6 +94,7 @@ class OnePass:
         self.frames, self.texture = sequence.select(axis), next(white, -1)
         self._shifts, self.ladder = pack_shifts(self.layout), pack_levels(self.layout)
         self._lists = spikes.allocate_lists(self.shape)
+        self._marks = spikes.allocate_marks(self.shape)
 
     def _pack_depths(self) -> tuple[kernels.Depths | StereoRig, tuple[int, int]]:
         """Return the calibration as the kernels take it, and the size (h, w) of its frames."""
@@ -160,12 +161,12 @@ class OnePass:
         """The second pass, over few pixels: spikes of one period are moved, lonely and outside
         pixels masked."""
         rules, maps = spikes.spike_rules(self.layout), scan.maps
-        columns, words, counts = self._lists
+        (columns, words, counts), marks = self._lists, self._marks
         if rules.is_plain:
-            spikes.list_changes(scan.phase, rules, False, columns, words, counts)
-            spikes.move_phases(columns, words, counts, scan.phase)
+            spikes.list_changes(scan.phase, rules, False, marks, columns, words, counts)
+            spikes.move_phases(columns, words, counts, scan.phase, marks)
             kernels.measure_moved(columns, words, counts, self.depths, maps)
-        spikes.list_changes(scan.phase, rules, True, columns, words, counts)
+        spikes.list_changes(scan.phase, rules, True, marks, columns, words, counts)
         spikes.mask_phases(columns, words, counts, scan.phase, scan.reason)
         kernels.mask_points(columns, counts, maps)
 

@@ -6,6 +6,7 @@ from scipy.optimize import nnls
 from slviewer.fringe.decode import decode
 from slviewer.fringe.noise import _fit_line
 from slviewer.fringe.presets import complementary, gray, p18
+from slviewer.fringe.sequence import one_axis
 
 pytestmark = pytest.mark.computes
 
@@ -36,6 +37,15 @@ def test_shot_and_read_noise(sequence, within, gamma, read, shot):
         expected = read**2 + 1 / 12 + shot * level
         # of the variance: half of it in sigma
         assert abs((a + b * level) / expected - 1) < 2 * within
+
+
+def test_gray_code_that_clips_in_every_block_still_has_noise():
+    truth, _ = scene()
+    sequence = one_axis(gray(PROJECTOR), "x")
+    frames = capture(sequence, truth, gain=60.0, read=12.0)
+    dark = np.clip(frames.astype(int) - int(frames.min()) - 40, 0, 255).astype(np.uint8)
+    a, b = decode(sequence, dark, "x").noise
+    assert 0.7 < (a + b * 20) / 12.0**2 < 1.5
 
 
 @pytest.mark.parametrize("steps", variants([3, 4, 5, 6, 7], 3, 4))
