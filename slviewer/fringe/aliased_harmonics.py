@@ -21,7 +21,7 @@ from slviewer.fringe import limits
 from slviewer.fringe.cosines import fit_cosine, select_rows
 from slviewer.fringe.layout import Layout
 from slviewer.fringe.phase import Noise
-from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.robust import robust_sigma, weighted_median
 
 MOST_STEPS = 4
 """From five steps on, harmonics below the fourth cause no error, and blur removes most of the
@@ -32,6 +32,9 @@ CONTROL = 3.0
 """... and times the ripple that gamma cannot make."""
 NOISE_PART = 0.5
 """An error below this part of the phase noise is neglected: it adds 12 % to it."""
+BRIGHT = 0.25
+"""Share of the strongest fringes of the image that a pixel's have at least: a tone curve amplifies
+the noise of pixels without light, and compression hides that of the others."""
 PIXELS = 40_000
 """Number of sampled pixels: enough to detect a ripple of half a thousandth."""
 MOST_CYCLES = 0.4
@@ -192,7 +195,7 @@ def _sample_lines(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return phasor, background and validity (lines, pixels) of some image rows.
 
-    Fourth, the median number of fringes per pixel along them.
+    Fourth, the median number of fringes per pixel along them, strong ones first.
     """
     rows = select_rows(stack.shape[1], stack.shape[2], PIXELS)
     frames = np.stack([stack[i][rows] for i in indices])
@@ -201,12 +204,15 @@ def _sample_lines(
     shape = frames.shape[1:]
     background, phasor = background.reshape(shape), phasor.reshape(shape)
     sigma = np.sqrt(np.maximum(noise[0] + noise[1] * background, 0))
-    valid = (np.abs(phasor) > np.maximum(limits.DARK_SIGMAS * sigma, 1e-3)) & ~clipped
+    modulation = np.abs(phasor)
+    least = max(BRIGHT * float(np.quantile(modulation, 0.98)), 1e-3)
+    valid = (modulation > np.maximum(limits.DARK_SIGMAS * sigma, least)) & ~clipped
     both = valid[:, 1:] & valid[:, :-1]
     if not both.any():
         return phasor, background, valid, 0.0
-    turn = np.angle(phasor[:, 1:] * np.conj(phasor[:, :-1]))[both]
-    return phasor, background, valid, float(np.median(np.abs(turn))) / (2 * np.pi)
+    product = (phasor[:, 1:] * np.conj(phasor[:, :-1]))[both]
+    turn = weighted_median(np.abs(np.angle(product)), np.abs(product))
+    return phasor, background, valid, turn / (2 * np.pi)
 
 
 class _Mean(NamedTuple):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats32, Mask
+from slviewer.geometry.robust import weighted_median
 from slviewer.geometry.vectors import thin_out
 
 TILES = (4, 5)
@@ -187,16 +188,11 @@ def _confirm(
     if np.count_nonzero(known) < REFINED:
         return np.zeros(LEVELS, np.float32)
     ratio, weight, bins = ratio[known], np.abs(shift[known]), level[v, u][known]
-    factors = np.full(LEVELS, _compute_weighted_median(ratio, weight), np.float32)
+    factors = np.full(LEVELS, weighted_median(ratio, weight), np.float32)
     for k in np.flatnonzero(np.bincount(bins, minlength=LEVELS) >= REFINED_AT_LEVEL):
-        factors[k] = _compute_weighted_median(ratio[bins == k], weight[bins == k])
+        factors[k] = weighted_median(ratio[bins == k], weight[bins == k])
     is_confirmed = REFINEMENT[0] <= factors.min() <= factors.max() <= REFINEMENT[1]
     return factors if is_confirmed else np.zeros(LEVELS, np.float32)
-
-
-def _compute_weighted_median(values: Floats32, weights: Floats32) -> float:
-    """Return the median of values of these weights, all above 0."""
-    return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
 
 
 @kernel()

@@ -6,7 +6,7 @@ from typing import TypeVar
 import numpy as np
 
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.rigid import Floats, Floats32
 
 Solution = TypeVar("Solution")
 RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))
@@ -18,6 +18,11 @@ def robust_sigma(residuals: Floats, about: float | None = None) -> float:
     deviation of normal residuals, robust to outliers."""
     centre = np.median(residuals) if about is None else about
     return float(1.4826 * np.median(np.abs(residuals - centre)))
+
+
+def weighted_median(values: Floats | Floats32, weights: Floats | Floats32) -> float:
+    """The median of values of these weights, all above 0."""
+    return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
 
 
 def tukey_weights(residuals: Floats, sigma: float) -> Floats:

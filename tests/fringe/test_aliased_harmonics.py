@@ -6,6 +6,7 @@ import pytest
 from decode_reference import decode_reference
 from facts import missing_facts
 from fringe_scene import capture, slope, variants, wrong
+from proofs.simulated_capture import draw_setup, render_capture
 
 from slviewer.examination.examine import examine
 from slviewer.fringe import decode as decode_module
@@ -63,6 +64,18 @@ def test_gamma_is_corrected_and_reported(monkeypatch, steps, gamma, times):
     assert phase.mask.mean() > 0.97
     [suspect] = gamma_suspects(sequence, stack)
     assert not missing_facts(suspect.observation, f"{steps} phase steps", "gamma")
+
+
+@pytest.mark.parametrize("pipeline", variants(["denoised", "JPEG 70"], "denoised"))
+def test_unlit_pixels_of_an_ordinary_camera_hide_no_gamma(pipeline):
+    setup = draw_setup("multifrequency", 9501, pipeline)
+    shot = render_capture(setup)
+    phase = decode(setup.described, shot.stack, "x")
+    error = (phase.coordinate - shot.truth["x"])[phase.mask] / phase.px_per_rad
+    angle = phase.steps * shot.truth["x"][phase.mask] / phase.px_per_rad
+    known = np.abs(error) < 0.5
+    ripple = 2 * np.mean((error * np.exp(1j * angle))[known])
+    assert abs(ripple) < 0.005  # rad; 0.1 where it was not found
 
 
 @pytest.mark.slow
