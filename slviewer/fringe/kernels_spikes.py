@@ -180,8 +180,8 @@ def allocate_lists(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def allocate_marks(shape: tuple[int, int]) -> np.ndarray:
-    """Allocate the marks (h, ceil(w / RUN)) of a map (h, w): a byte for each pixel that is examined,
-    zero beyond the last."""
+    """Allocate the marks (h, ceil(w / RUN)) of a map (h, w): a byte for each pixel that is
+    examined, zero beyond the last."""
     return np.zeros((shape[0], -(-shape[1] // RUN)), np.uint64)
 
 

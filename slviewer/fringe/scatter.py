@@ -8,6 +8,7 @@ has smoothed its blocks of 8 x 8 pixels, from block to block.
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -18,6 +19,9 @@ WINDOW = 16
 """px: side of a window, two blocks of JPEG."""
 WINDOWS = 14
 """Windows that are sampled along a column of the image, and along a row."""
+HOLES = 0.2
+"""Largest share of a window's pixels without a phase: strong compression spoils single ones all
+over an image. A block has some left."""
 FEWEST = 30
 """Number of valid windows below which the scatter is not measured."""
 BLOCK = 8
@@ -76,7 +80,8 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
     values, background, modulation = (
         _cut_windows(each, first) for each in (phase.phase, phase.background, phase.modulation)
     )
-    values = values - values.mean(axis=(1, 2), keepdims=True)  # exact enough in float32
+    values = values - np.nanmean(values, axis=(1, 2), keepdims=True)  # exact enough in float32
+    holes = _fill_holes(values)
     third = [np.diff(values, n=3, axis=axis) for axis in (1, 2)]
     blockiness = max(
         _measure_blockiness(np.abs(np.moveaxis(third[i], i + 1, 2)), first[:, i]) for i in range(2)
@@ -85,6 +90,7 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
     predicted = np.maximum(np.float32(a) + np.float32(b) * background, np.float32(ROUNDING))
     predicted *= np.float32(2 / phase.steps) / np.maximum(modulation, np.float32(1e-6)) ** 2
     predicted += np.float32(phase.model_error_rad**2)
+    predicted[holes] = 0  # they do not scatter
     if blockiness > BLOCKINESS:
         ratio = float(np.median(_compute_window_variance(values) / predicted.mean(axis=(1, 2))))
         return Scatter(float(np.sqrt(ratio)), blockiness)
@@ -97,14 +103,27 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
 
 def _select_valid_windows(phase: PhaseMap) -> np.ndarray:
     """Return row and column of the first pixel (m, 2) of evenly spread windows in which every pixel
-    is valid."""
+    is valid, or nearly every where these are few."""
     height, width = phase.phase.shape
     corners = [
         np.unique(np.linspace(0, size - WINDOW, min(WINDOWS, size // WINDOW)).astype(int))
         for size in (height, width)
     ]
     first = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 2)
-    return first[(_cut_windows(phase.reason, first) == Reason.VALID).all(axis=(1, 2))]
+    holes = (_cut_windows(phase.reason, first) != Reason.VALID).mean(axis=(1, 2))
+    is_whole = holes == 0
+    return first[is_whole if np.count_nonzero(is_whole) >= FEWEST else holes <= HOLES]
+
+
+def _fill_holes(values: np.ndarray) -> np.ndarray:
+    """Give the NaN of windows (m, WINDOW, WINDOW), in place, the values of the cubic surface fitted
+    to the others; return where they were."""
+    basis, holes = _make_cubic_basis(), np.isnan(values)
+    for k in np.flatnonzero(holes.any(axis=(1, 2))):
+        window, here = values[k], holes[k].ravel()
+        fitted = np.linalg.lstsq(basis[~here], window[~holes[k]], rcond=None)[0]
+        window[holes[k]] = basis[here] @ fitted
+    return holes
 
 
 def _cut_windows(image: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -133,12 +152,17 @@ def _measure_blockiness(third: np.ndarray, first: np.ndarray) -> float:
 def _compute_window_variance(values: np.ndarray) -> np.ndarray:
     """Return the variance (m,) of windows (m, WINDOW, WINDOW) about the cubic surface fitted to
     each."""
-    x = np.linspace(-1, 1, WINDOW)
-    powers = [(i, j) for i in range(4) for j in range(4 - i)]
-    basis, _ = np.linalg.qr(np.stack([np.outer(x**i, x**j).ravel() for i, j in powers], axis=1))
-    flat = values.reshape(len(values), -1).astype(np.float64)
+    basis, flat = _make_cubic_basis(), values.reshape(len(values), -1).astype(np.float64)
     remaining = (flat**2).sum(axis=1) - (np.einsum("mp,pk->mk", flat, basis) ** 2).sum(axis=1)
-    return np.asarray(remaining / (WINDOW**2 - len(powers)))
+    return np.asarray(remaining / (WINDOW**2 - basis.shape[1]))
+
+
+@cache
+def _make_cubic_basis() -> np.ndarray:
+    """Return orthonormal cubic surfaces (WINDOW^2, 10) of a window."""
+    x = np.linspace(-1, 1, WINDOW)
+    powers = [np.outer(x**i, x**j).ravel() for i in range(4) for j in range(4 - i)]
+    return np.asarray(np.linalg.qr(np.stack(powers, axis=1))[0])
 
 
 def _compute_block_variance(values: np.ndarray) -> np.ndarray:
