@@ -2,7 +2,8 @@
 counts."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import PurePath
 
 from slviewer.errors import InputError
 
@@ -108,3 +109,41 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key that puts `pose_2` before `pose_10`."""
     parts = re.split(r"(\d+)", name.lower())
     return [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts]
+
+
+def natural_order(files: Sequence[str]) -> list[str]:
+    """Names of files in natural order: 2 before 10.
+
+    Where they count without a gap in hexadecimal digits (f, 10), in letters (z, aa), or in a
+    camera's four digits that begin again (9999, 0001), in the order of that count.
+    """
+    found = sorted(files, key=natural_key)
+    if len(found) < 2:
+        return found
+    stems = [PurePath(name).stem.lower() for name in found]
+    ends = [stem[_count_shared(stems) :] for stem in stems]
+    shared = _count_shared([end[::-1] for end in ends])
+    for values in _read_counts([end[: len(end) - shared] for end in ends]):
+        if sorted(values) == [*range(min(values), min(values) + len(values))]:
+            return [name for _, name in sorted(zip(values, found, strict=True))]
+    return found
+
+
+def _count_shared(texts: Sequence[str]) -> int:
+    """Count the characters with which all texts begin."""
+    return next(
+        (i for i, each in enumerate(zip(*texts, strict=False)) if len({*each}) > 1),
+        min(map(len, texts)),
+    )
+
+
+def _read_counts(counts: Sequence[str]) -> Iterator[list[int]]:
+    """Yield the numbers that the differing parts of names are, as each kind of count reads them."""
+    if all(re.fullmatch("[0-9a-f]+", count) for count in counts):
+        yield [int(count, 16) for count in counts]
+    if all(re.fullmatch("[a-z]{1,2}", count) for count in counts):
+        yield [26 * (len(count) > 1) * (ord(count[0]) - 96) + ord(count[-1]) for count in counts]
+    if all(re.fullmatch("[0-9]{4}", count) for count in counts):
+        numbers = [int(count) for count in counts]
+        again = 10_000 - (0 not in numbers)
+        yield [number + again * (number < 5_000) for number in numbers]

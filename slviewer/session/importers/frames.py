@@ -36,8 +36,9 @@ bits = 7
 ```
 
 A long sequence is shorter in groups, `[[frames]]` in place of `[[frame]]`. The files of a group are
-one pattern, in natural order of the names (2 before 10), or a list. With `order = "name"` at the
-top no entry names files: all images of a folder are taken in natural order of their names.
+one pattern, in natural order of the names (2 before 10, and what counts in hexadecimal, in letters,
+or on from a camera's 9999, as it counts), or a list. With `order = "name"` at the top no entry
+names files: all images of a folder are taken in natural order of their names.
 
 ```toml
 projector = "1280x800"

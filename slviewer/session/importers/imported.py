@@ -21,7 +21,7 @@ from slviewer.session.importers.images import (
     read_frames,
     warn_of_unread,
 )
-from slviewer.session.names import join_names, natural_key, new_name, plain_name
+from slviewer.session.names import join_names, natural_key, natural_order, new_name, plain_name
 from slviewer.session.reading import expand_user
 
 _MOST_REASONS = 3
@@ -204,7 +204,7 @@ def match_files(folder: Path, pattern: str) -> list[Path]:
 
 
 def images_by_name(folder: Path, pattern: re.Pattern[str] = re.compile("")) -> list[Path]:
-    """The images of a folder whose name matches, in natural order of their names: 2 before 10. Of a
+    """The images of a folder whose name matches, in `natural_order` of their names. Of a
     RAW file and an image that the camera made of it, the RAW file alone."""
     images = [
         entry
@@ -213,7 +213,7 @@ def images_by_name(folder: Path, pattern: re.Pattern[str] = re.compile("")) -> l
     ]
     raw = {file.stem for file in images if is_raw(file)}
     chosen = [file for file in images if is_raw(file) or file.stem not in raw]
-    return sorted(chosen, key=lambda file: natural_key(file.name))
+    return [folder / name for name in natural_order([file.name for file in chosen])]
 
 
 def match_images(
