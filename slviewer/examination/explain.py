@@ -239,7 +239,8 @@ def _list_likely(
 ) -> Sequence["_Rated"]:
     """Return the best explanation, then those that account for all images about as well: one that
     leaves none out is preferred, and comes first where it leaves as little, as a lost image of few
-    steps fits what begins elsewhere. ``gained``: cost of the description's directions."""
+    steps fits what begins elsewhere; before it, images that are late from one on that is the same
+    as the one before. ``gained``: cost of the description's directions."""
     first, *others = rated
     most_left, k = first.most_left, first.hypotheses[0].excluded
     if k is not None:  # all images are compared, that one too
@@ -256,10 +257,13 @@ def _list_likely(
     is_seen = best.cause == "frame-lag" and bool(best.frames)  # as an image that repeats another
     least = 0.0 if is_seen or not best.loses_images else first.comparison.left + limits.LEFT_ALIKE
     whole = [r for r in rivals if r.comparison.left < least and not r.hypotheses[0].is_of_files]
+    alike = first.comparison.left + limits.LEFT_ALIKE
     if best.is_of_files:  # cameras are late more often than names are out of order
-        alike = first.comparison.left + limits.LEFT_ALIKE
         whole = [r for r in others if r.hypotheses[0].is_late and r.comparison.left < alike]
-    return *whole, first, *rivals
+    same = [
+        r for r in rated if r.comparison.left < alike and _is_repeated(evaluator, r.hypotheses[0])
+    ]
+    return *same, *whole, first, *rivals
 
 
 def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
@@ -393,12 +397,20 @@ def _repetition(evaluator: Evaluator, hypothesis: Hypothesis) -> float:
     return float(squares.mean() / np.mean(sample.swing**2))
 
 
+def _is_repeated(evaluator: Evaluator, hypothesis: Hypothesis) -> bool:
+    """Return whether images are late from one on that is the same as the one before."""
+    is_lag = hypothesis.cause == "frame-lag" and bool(hypothesis.frames)
+    return is_lag and _repetition(evaluator, hypothesis) < limits.SAME
+
+
 def _explain_by_one(
     evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated"
 ) -> Explanation:
     """Return what explains all images better than the explanation that was found: that a single one
     shows something else; empty where none does. What was rated leaves that image out."""
     first = found.hypotheses[0]
+    if _is_repeated(evaluator, first):
+        return ()
     few = first.changed if len(first.changed) <= limits.MOST_SINGLE else []
     every, base = range(len(first.images)), described(first.sequence)
     least, best = found.comparison.left - limits.LEFT_LEAST, None

@@ -74,6 +74,8 @@ from the projector's first column, at which whole periods may be wrong."""
 REPEATED = 0.06
 """Mean squared difference, in squares of the range, up to which an image repeats another, also with
 a fifth of the next one in it; those of eight phase steps differ by 0.07, of fewer by more."""
+SAME = 1e-6
+"""... and the one below which it is the same image: noise alone differs by more."""
 KEPT = 8
 """Hypotheses that are compared on all pixels, of those that the small sample ranks best."""
 SIGMAS = 5.0
