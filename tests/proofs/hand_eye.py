@@ -66,7 +66,7 @@ def draw_robot(
 ) -> Robot:
     """Return a robot at poses by which the camera sees ``boards``, or at ``flanges`` (n, 4, 4)."""
     in_hand = mounting == "eye-in-hand"
-    turns = Rotation.random(2, rng=rng).as_matrix()
+    turns = Rotation.random(2, random_state=rng).as_matrix()
     near, far = rng.uniform(-80, 80, 3), rng.uniform(400, 900, 3)
     X, Z = rigid(turns, np.array([near, far] if in_hand else [far, near]))
     if flanges is None:

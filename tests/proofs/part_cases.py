@@ -476,5 +476,5 @@ def _draw_pose(rng: np.random.Generator, size: float, views: Sequence[Floats]) -
     if views:
         R = _look_at_origin(views[0][0], rng.normal(size=3))
         return rigid_transform(R, -R @ views[0][0])
-    R = Rotation.random(rng=rng).as_matrix()
+    R = Rotation.random(random_state=rng).as_matrix()
     return rigid_transform(R, rng.uniform(-3, 3, 3) * size)

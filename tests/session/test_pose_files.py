@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.session.importers.pose_files import match_captures, read_pose_file
 
 RNG = np.random.default_rng(1)
-TURNS = Rotation.random(3, rng=RNG)
+TURNS = Rotation.random(3, random_state=RNG)
 PLACES = RNG.uniform(-400, 400, (3, 3))
 
 
