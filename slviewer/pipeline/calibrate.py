@@ -110,7 +110,7 @@ class CalibrateSettings:
             distortion.
         degree: Degree of the polynomial, with --smoothing polynomial.
         camera: File with a calibration of the camera, where that of its lens starts: of
-            --camera-only, OpenCV, ROS, Kalibr or MATLAB.
+            --camera-only, OpenCV, NumPy, ROS, Kalibr, MATLAB, COLMAP, Metashape or calib.io.
         fix_camera: Keep the lens of that file as it is, so that few poses of little tilt are
             enough.
 

@@ -16,7 +16,7 @@ from slviewer.session.importers.camera_file import read_camera_file
 from slviewer.session.importers.clouds import ReadCloud, read_cloud
 from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.importers.opencv_calibration import identify_keys, list_unused, read_matrices
-from tests.proofs.file_variants import calibrations, clouds, texts
+from tests.proofs.file_variants import calibrations, clouds, makers, texts
 from tests.proofs.file_variants.calibrations import SIZE, Camera
 from tests.proofs.file_variants.variant import Points, Variant
 from tests.proofs.proof import Proof
@@ -59,12 +59,21 @@ DRAWS: Mapping[str, tuple[Draw, int]] = {
     "ini": (calibrations.draw_ini, 12),
     "matlab": (calibrations.draw_matlab, 12),
     "kalibr": (calibrations.draw_kalibr, 10),
+    "no lens": (makers.draw_kalibr_without, 4),
+    "npz": (makers.draw_npz, 24),
+    "bouguet": (makers.draw_bouguet, 12),
+    "colmap": (makers.draw_colmap, 40),
+    "metashape": (makers.draw_metashape, 40),
+    "calib.io": (makers.draw_calibio, 20),
+    "unread": (makers.draw_unread, 24),
     "spoilt": (calibrations.cut_calibration, 16),
 }
 """Of each format what draws a file, and how many are drawn."""
 KINDS = ("equal", "said", "SILENT LOSS", "WRONG REASON", "TRACEBACK")
 """How reading a file ends; the last three are faults."""
 MAX_PX = 0.01
+_OF_CAMERAS = list(DRAWS)[list(DRAWS).index("json") :]
+"""Formats of which some files hold no lens that can be read."""
 _FAR_MM = 5e4
 """From here on files hold coordinates in more than float32."""
 _ULPS = 4.0
@@ -78,7 +87,7 @@ def judge(variant: Variant, folder: Path) -> tuple[str, str]:
     try:
         if variant.format == "stereo":
             return _judge_stereo(variant, path)
-        if isinstance(variant.truth, Camera) or variant.format in ("spoilt", "json"):
+        if isinstance(variant.truth, Camera) or variant.format in _OF_CAMERAS:
             return _judge_camera(variant, path)
         (cloud,) = read_cloud(path)[1]
         return _judge_cloud(variant, cloud)

@@ -132,3 +132,43 @@ def test_other_models_and_several_cameras_are_refused(
     with pytest.raises(InputError) as caught:
         read_camera_file(text(tmp_path / "a.yaml", entries), SIZE)
     assert missing_facts(str(caught.value), *facts) == []
+
+
+COLMAP = "# Camera list\n1 OPENCV 400 300 890.0 889.0 200.0 149.0 -0.1 0.05 0.001 -0.002\n"
+METASHAPE = (
+    "<calibration><projection>frame</projection><width>400</width><height>300</height>"
+    "<f>889</f><cx>0</cx><cy>-1</cy><b1>1</b1><k1>-0.1</k1><k2>0.05</k2><k3>0.01</k3>"
+    "<p1>-0.002</p1><p2>0.001</p2></calibration>"
+)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("name", "content"), [("cameras.txt", COLMAP), ("a.xml", METASHAPE)])
+def test_pixels_that_count_from_the_corner(name: str, content: str, tmp_path: Path) -> None:
+    """Both makers put the centre of the first pixel at 0.5; Metashape exchanges p1 and p2."""
+    (tmp_path / name).write_text(content)
+    found = read_camera_file(tmp_path / name, SIZE)
+    np.testing.assert_allclose(found.lens.K, K)
+    np.testing.assert_allclose(found.lens.D[:4], D[:4])
+    assert found.notes == ()
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("name", "content", "facts"),
+    [
+        ("a.pkl", b"\x80\x04}.", ("pickle", "savez")),
+        ("cameras.bin", b"\1\0\0\0", ("COLMAP", "cameras.txt")),
+        ("a.cal", b"# c\nParGroup: Camera: Parameter;", ("HALCON",)),
+        ("a.xml", METASHAPE.replace("<cx>", "<k4>1</k4><cx>").encode(), ("Metashape", "k4")),
+        ("cameras.txt", COLMAP.replace("OPENCV", "FOV").encode(), ("COLMAP", "FOV")),
+        ("a.json", b'{"views": [], "intrinsics": [{"width": "4"}]}', ("Meshroom",)),
+    ],
+)
+def test_makers_of_other_files_are_named(
+    name: str, content: bytes, facts: tuple[str, ...], tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_camera_file(tmp_path / name, SIZE)
+    assert missing_facts(str(caught.value), name, *facts) == []

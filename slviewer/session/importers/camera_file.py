@@ -1,8 +1,9 @@
 """A camera's lens from a file that another program, or `calibrate --camera-only`, wrote.
 
-Read are OpenCV FileStorage (YAML, XML, JSON), camera_info of ROS (YAML, INI), camchain.yaml of
-Kalibr, and exports of MATLAB's cameraParameters as YAML or JSON, by the names of their entries.
-Entries that nothing reads are named in a note.
+Read are OpenCV FileStorage (YAML, XML, JSON), NPZ of NumPy, camera_info of ROS (YAML, INI),
+camchain.yaml of Kalibr, exports of MATLAB's cameraParameters as YAML or JSON, Calib_Results.mat of
+Bouguet's toolbox, by the names of their entries, and what `calibration_makers` converts. Entries
+that nothing reads are named in a note.
 """
 
 import re
@@ -33,7 +34,12 @@ DISTORTIONS = (
     "dist1", "kc", "d1", "d",
 )  # fmt: skip
 SIZES = ("camerasize", "camsize", "imagesize", "resolution")
-PAIRS = (("imagewidth", "imageheight"), ("framewidth", "frameheight"), ("width", "height"))
+PAIRS = (
+    ("imagewidth", "imageheight"),
+    ("framewidth", "frameheight"),
+    ("width", "height"),
+    ("nx", "ny"),
+)
 """Names of entries, without case and underscores, behind the last dot."""
 FISHEYE = {"fisheye", "equidistant", "kannala", "equi"}
 CENTRES = (("cx", "cy"), ("ppx", "ppy"))
@@ -272,7 +278,10 @@ class _Entries:
         """Return the camera matrix (3, 3); pixel (0, 0) is the centre of the top left one."""
         given = self._select(MATRICES, 9)
         four: Floats | list[float] | None = self.get("intrinsics", 4)
-        focal, point = self.get("focallength", 1, 2), self.get("principalpoint", 2)
+        focal, point = (
+            self._select(names, 1, 2)
+            for names in (("focallength", "fc"), ("principalpoint", "cc"))  # fc, cc: Bouguet's
+        )
         if focal is not None and point is not None:
             four = np.append(np.broadcast_to(focal.ravel(), 2), point)
         if four is None:
@@ -317,6 +326,7 @@ class _Entries:
             for plain, key in self.keys.items()
             if re.search("dist|coeff|radial", plain) or plain in DISTORTIONS
             if key not in self.used | self.storage.words.keys()
+            if (value := self.storage.entries[key]) is None or value.size
         ]
         if named:
             raise InputError(

@@ -1,5 +1,5 @@
-"""Calibration files of other programs (YAML, XML, JSON of OpenCV and others, INI, MAT), parsed in a
-process of its own.
+"""Calibration files of other programs (YAML, XML, JSON of OpenCV and others, INI, MAT, NPZ), parsed
+in a process of its own.
 
 Some malformed ones make a parser use all memory or never end.
 """
@@ -7,7 +7,8 @@ Some malformed ones make a parser use all memory or never end.
 import json
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,12 @@ import numpy as np
 import yaml
 
 from slviewer.errors import InputError
+from slviewer.session.importers.calibration_makers import (
+    convert_json,
+    read_colmap,
+    read_metashape,
+    refuse_unread,
+)
 from slviewer.session.reading import limit_process, read_input, run_isolated
 
 _MAX_BYTES = 1 << 24
@@ -56,17 +63,21 @@ class Storage:
 
 def read_storage(path: Path) -> Storage:
     """The matrices of a calibration file; InputError where it cannot be read."""
-    kinds = "YAML, XML, JSON, INI or MAT"
-    check_mat(path.name, read_input(path, _MAX_BYTES, f"give a calibration as {kinds}"))
+    kinds = "YAML, XML, JSON, INI, MAT or NPZ"
+    data = read_input(path, _MAX_BYTES, f"give a calibration as {kinds}")
+    check_mat(path.name, data)
+    refuse_unread(path.name, data)
     status, output = run_isolated(__name__, str(path.absolute()))
     if status != 0:
         reason = "damaged, or none" if status == 1 else "too large, or none"
         raise InputError(
             f"{path.name} is {reason} of the calibration files that are read ({kinds}, as OpenCV,"
-            " ROS, Kalibr and MATLAB write them)",
+            " ROS, Kalibr, MATLAB, NumPy, COLMAP, Metashape and calib.io write them)",
             "export the calibration again",
         )
-    entries, words = json.loads(output)
+    entries, words, refusal = json.loads(output)
+    if refusal:
+        raise InputError(refusal[0], refusal[1], path.name)
     return Storage(
         path.name,
         {key: None if v is None else np.array(v, np.float64) for key, v in entries.items()},
@@ -86,12 +97,17 @@ def _parse(path: str) -> tuple[dict[str, Any], dict[str, str]]:
 
     Entries of a mapping have its key and a dot before their own.
     """
-    is_mat = Path(path).suffix.lower() == ".mat"
-    text = "" if is_mat else Path(path).read_text(encoding="utf-8-sig")
-    if is_mat:
+    suffix = Path(path).suffix.lower()
+    text = "" if suffix in (".mat", ".npz") else Path(path).read_text(encoding="utf-8-sig")
+    if suffix == ".mat":
         tree = {key: v for key, v in _load_mat(path).items() if not key.startswith("__")}
+    elif suffix == ".npz":
+        tree = _load_npz(path)
     elif text.lstrip().startswith("<"):
-        tree = _read_xml(ElementTree.fromstring(text))  # noqa: S314 - within limits
+        root = ElementTree.fromstring(text)  # noqa: S314 - within limits
+        tree = read_metashape(root) or _read_xml(root)
+    elif (colmap := read_colmap(text)) is not None:
+        tree = colmap
     elif re.match(r"\s*([#;].*\s+)*\[[^\]\n,]+\]\s*\n", text):
         tree = _read_ini(text)
     else:
@@ -102,7 +118,7 @@ def _parse(path: str) -> tuple[dict[str, Any], dict[str, str]]:
         raise ValueError("no storage")
     numbers: dict[str, Any] = {}
     words: dict[str, str] = {}
-    _flatten("", tree, numbers, words)
+    _flatten("", convert_json(tree), numbers, words)
     return numbers, words
 
 
@@ -112,6 +128,19 @@ def _load_mat(path: str) -> dict[str, Any]:
 
     found: dict[str, Any] = loadmat(path, simplify_cells=True)
     return found
+
+
+def _load_npz(path: str) -> dict[str, Any]:
+    """Return the arrays of an NPZ file; None for those of Python's objects, or of other kinds."""
+    tree: dict[str, Any] = {}
+    with np.load(path, allow_pickle=False) as archive:
+        for key in archive.files:
+            tree[key] = None
+            with suppress(ValueError):  # an object, which a pickle holds
+                array = archive[key]
+                is_plain = array.dtype.kind in "biufU" and array.size <= _MAX_NUMBERS
+                tree[key] = array.tolist() if is_plain else None
+    return tree
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -170,7 +199,7 @@ def _list_lines(text: str) -> Iterable[str]:
 
 
 def _flatten(
-    start: str, tree: dict[Any, Any], numbers: dict[str, Any], words: dict[str, str]
+    start: str, tree: Mapping[Any, Any], numbers: dict[str, Any], words: dict[str, str]
 ) -> None:
     """Fill in the ``numbers`` and ``words`` of a mapping, whose keys begin with ``start``."""
     for name, value in tree.items():
@@ -213,4 +242,7 @@ def _to_matrix(value: Any) -> np.ndarray:
 
 if __name__ == "__main__":
     limit_process()
-    print(json.dumps(_parse(sys.argv[1])))
+    try:
+        print(json.dumps([*_parse(sys.argv[1]), None]))
+    except InputError as refused:
+        print(json.dumps([{}, {}, [refused.observation, refused.remedy]]))

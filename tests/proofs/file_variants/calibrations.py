@@ -35,7 +35,7 @@ class Camera:
         return cv2.projectPoints(points, zero, zero, self.K, self.D)[0].reshape(-1, 2)
 
 
-def _draw_camera(form: Form, *counts: int, stereo: bool = False) -> Camera:
+def draw_camera(form: Form, *counts: int, stereo: bool = False) -> Camera:
     """Draw a lens with so many coefficients, those behind the fifth zero at times."""
     rng = form.rng
     f = rng.uniform(700, 1200)  # no distortion drawn folds the image over
@@ -52,7 +52,7 @@ def _draw_camera(form: Form, *counts: int, stereo: bool = False) -> Camera:
     return Camera(K, D[:count], R=R, T=rng.uniform(50, 200, 3))
 
 
-def _list_reasons(camera: Camera) -> tuple[str, ...]:
+def list_reasons(camera: Camera) -> tuple[str, ...]:
     """Return the words of which a refusal of a lens that five coefficients cannot hold has one."""
     if camera.fisheye:
         return ("fisheye", "equidistant", "residual")
@@ -78,10 +78,10 @@ def draw_ros(rng: np.random.Generator) -> Variant:
     form = Form(rng)
     model = form.draw("model", "plumb_bob", "plumb_bob", "rational_polynomial", "equidistant")
     if model == "equidistant":
-        camera = _draw_camera(form, 4)
+        camera = draw_camera(form, 4)
         camera = Camera(camera.K, camera.D * 0.2, True)
     else:
-        camera = _draw_camera(form, *((5, 4) if model == "plumb_bob" else (8,)))
+        camera = draw_camera(form, *((5, 4) if model == "plumb_bob" else (8,)))
     style = form.draw("lists", "flow", "block")
     numbers = form.draw("numbers", "plain", "short", "exponent", "opencv")
     cols = form.draw("cols", camera.D.size, camera.D.size, 5)
@@ -108,7 +108,7 @@ def draw_ros(rng: np.random.Generator) -> Variant:
         lines += [f"{name}:", *(shape[::-1] if order else shape), *rows]
     content = end_lines("\n".join(lines) + "\n", form.draw("end", "\n", "\r\n"))
     suffix = form.draw("suffix", "yaml", "yml")
-    reasons = (*_list_reasons(camera), *(("cols", "5") if cols != camera.D.size else ()))
+    reasons = (*list_reasons(camera), *(("cols", "5") if cols != camera.D.size else ()))
     return Variant(
         "ros", form.text(), f"a.{suffix}", content, camera,
         [["rectification_matrix"], ["projection_matrix"]], reasons,
@@ -118,7 +118,7 @@ def draw_ros(rng: np.random.Generator) -> Variant:
 def draw_echo(rng: np.random.Generator) -> Variant:
     """Draw a message of camera_info as ROS prints it."""
     form = Form(rng)
-    camera = _draw_camera(form, 5, 8)
+    camera = draw_camera(form, 5, 8)
     model = "plumb_bob" if camera.D.size == 5 else "rational_polynomial"
     upper = form.draw("capitals", True, False)
     projection = np.hstack([camera.K, np.zeros((3, 1))])
@@ -130,14 +130,14 @@ def draw_echo(rng: np.random.Generator) -> Variant:
     text += "binning_x: 0\nroi: \n  x_offset: 0\n  height: 0\n  width: 0\n---\n"
     extras = [["P", "p,"], ["binning_x"], ["roi.x_offset"], ["header.seq"]]
     return Variant(
-        "ros", form.text(), "a.yaml", text.encode(), camera, extras, _list_reasons(camera)
+        "ros", form.text(), "a.yaml", text.encode(), camera, extras, list_reasons(camera)
     )
 
 
 def draw_realsense(rng: np.random.Generator) -> Variant:
     """Draw intrinsics of a depth camera as JSON, of one stream or of two."""
     form = Form(rng)
-    camera = _draw_camera(form, 5)
+    camera = draw_camera(form, 5)
     model = form.draw("model", "brown_conrady", "inverse_brown_conrady")
     (fx, _, ppx), (_, fy, ppy), _ = camera.K.tolist()
     stream = {"width": 640, "height": 480, "ppx": ppx, "ppy": ppy, "fx": fx, "fy": fy}
@@ -198,7 +198,7 @@ def draw_opencv(rng: np.random.Generator) -> Variant:
     """Draw an OpenCV FileStorage of one camera."""
     form = Form(rng)
     fisheye = form.draw("fisheye", False, False, False, True)
-    camera = _draw_camera(form, *((4,) if fisheye else (4, 5, 8, 12, 14)))
+    camera = draw_camera(form, *((4,) if fisheye else (4, 5, 8, 12, 14)))
     if fisheye:
         camera = Camera(camera.K, camera.D * 0.2, True)
     names = form.draw(
@@ -222,14 +222,14 @@ def draw_opencv(rng: np.random.Generator) -> Variant:
     kind = form.draw("kind", "yml", "xml", "json")
     content = end_lines(_to_opencv(entries, kind, form), form.draw("end", "\n", "\r\n"))
     return Variant(
-        "opencv", form.text(), f"a.{kind}", content, camera, extras, _list_reasons(camera)
+        "opencv", form.text(), f"a.{kind}", content, camera, extras, list_reasons(camera)
     )
 
 
 def draw_stereo(rng: np.random.Generator) -> Variant:
     """Draw an OpenCV FileStorage of a camera and a projector."""
     form = Form(rng)
-    camera = _draw_camera(form, 4, 5, 8, stereo=True)
+    camera = draw_camera(form, 4, 5, 8, stereo=True)
     assert camera.R is not None and camera.T is not None
     names = form.draw(
         "names", ("K1", "D1", "K2", "D2"), ("M1", "D1", "M2", "D2"),
@@ -245,7 +245,7 @@ def draw_stereo(rng: np.random.Generator) -> Variant:
         extras = [["E"], ["Q"]]
     kind = form.draw("kind", "yml", "xml", "json")
     content = end_lines(_to_opencv(entries, kind, form), form.draw("end", "\n", "\r\n"))
-    reasons = _list_reasons(camera)
+    reasons = list_reasons(camera)
     return Variant("stereo", form.text(), f"a.{kind}", content, camera, extras, reasons)
 
 
@@ -253,7 +253,7 @@ def draw_matlab_stereo(rng: np.random.Generator) -> Variant:
     """Draw a struct of MATLAB's stereoParameters, old or new, or the variables of Bouguet's
     toolbox, as MAT or JSON."""
     form = Form(rng)
-    camera = _draw_camera(form, 5, stereo=True)
+    camera = draw_camera(form, 5, stereo=True)
     assert camera.R is not None and camera.T is not None
     kind = form.draw("kind", "old", "new", "bouguet")
     tree: dict[str, object] = {"R": camera.R, "T": camera.T[:, None], "om": np.ones((3, 1))}
@@ -289,7 +289,7 @@ def draw_matlab_stereo(rng: np.random.Generator) -> Variant:
 def draw_ini(rng: np.random.Generator) -> Variant:
     """Draw the INI of ROS, or one of names with values."""
     form, camera = Form(rng), None
-    camera = _draw_camera(form, 5)
+    camera = draw_camera(form, 5)
     (fx, _, cx), (_, fy, cy), _ = camera.K
     if form.draw("kind", "ros", "names") == "ros":
         rows = "\n".join(" ".join(f"{v:.10f}" for v in row) for row in camera.K)
@@ -318,7 +318,7 @@ def draw_ini(rng: np.random.Generator) -> Variant:
 def draw_matlab(rng: np.random.Generator) -> Variant:
     """Draw a struct of MATLAB's cameraParameters as JSON, whose pixels count from 1."""
     form, camera = Form(rng), None
-    camera = _draw_camera(form, 4, 5)
+    camera = draw_camera(form, 4, 5)
     k1, k2, p1, p2, *k3 = camera.D.tolist()
     matrix = camera.K + np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     struct: dict[str, object] = {
@@ -352,7 +352,7 @@ def draw_kalibr(rng: np.random.Generator) -> Variant:
     """Draw a camchain of Kalibr."""
     form = Form(rng)
     model = form.draw("model", "radtan", "radtan", "equidistant")
-    camera = _draw_camera(form, 4)
+    camera = draw_camera(form, 4)
     if model == "equidistant":
         camera = Camera(camera.K, camera.D * 0.2, True)
     (fx, _, cx), (_, fy, cy), _ = camera.K
@@ -369,7 +369,7 @@ def draw_kalibr(rng: np.random.Generator) -> Variant:
         text += "  timeshift_cam_imu: 0.001\n"
         extras.append(["timeshift_cam_imu"])
     return Variant(
-        "kalibr", form.text(), "a.yaml", text.encode(), camera, extras, _list_reasons(camera)
+        "kalibr", form.text(), "a.yaml", text.encode(), camera, extras, list_reasons(camera)
     )
 
 
