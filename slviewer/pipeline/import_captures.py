@@ -52,7 +52,7 @@ from slviewer.session.importers import matlab_calibration, opencv_calibration
 from slviewer.session.importers.filestorage import Storage, read_storage
 from slviewer.session.importers.guess import describe_reversal
 from slviewer.session.importers.guessed_frames import guess_description
-from slviewer.session.importers.images import Channel
+from slviewer.session.importers.images import Channel, file_of
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,
@@ -341,7 +341,7 @@ def _layout_of_session(store: Session | None, source: Path) -> FolderLayout | No
         folder: capture
         for folder in list_folders(source)
         for capture in reversed(captures)
-        if all((folder / file).is_file() for file in capture.files)
+        if all(file_of(folder / file).is_file() for file in capture.files)
     }
 
     def describe(

@@ -123,6 +123,34 @@ def test_a_scan_takes_size_and_description_of_the_session(
         assert first.sequence == second.sequence and second.role == "scan"
 
 
+@pytest.mark.parametrize("stacks", [(28,), (14, 14), (14, 14, 0)])
+def test_images_of_a_tiff_are_frames_in_order(
+    run: Run, tmp_path: Path, stacks: tuple[int, ...]
+) -> None:
+    """One TIFF of a folder, one for each axis by a pattern; two without a pattern are refused."""
+    frames = photographed(gray(PROJECTOR), 0)[:28]
+    folder, toml = tmp_path / "scan", GRAY.partition('[[frames]]\nkind = "white"')[0]
+    folder.mkdir()
+    first = 0
+    for name, count in zip("xy", filter(None, stacks), strict=False):
+        assert cv2.imwritemulti(str(folder / f"{name}.tif"), frames[first : first + count])
+        first += count
+        if len(stacks) == 2:
+            toml = toml.replace(f'axis = "{name}"', f'axis = "{name}"\nfiles = "{name}*.tif"')
+    if len(stacks) == 2:
+        toml = toml.replace('order = "name"\n', "")
+    (folder / "gray.toml").write_text(toml)
+    status, _, err = run("import", "frames", folder, tmp_path / "session")
+    if len(stacks) == 3:
+        assert status == 1 and not missing_facts(err, "x.tif", "14 images")
+        return
+    assert status == 0, err
+    with Session.open(tmp_path / "session") as store:
+        capture = store.load_capture("scan")
+        assert np.array_equal(capture.stack(), frames)
+        assert capture.files[-1] == ("x.tif/x_028.tif" if len(stacks) == 1 else "y.tif/y_014.tif")
+
+
 def test_a_code_that_is_centred_on_the_projector(run: Run, tmp_path: Path) -> None:
     """128 codes for 90 rows: code 0 begins 19 px before the first one."""
     sequence = replace(gray(PROJECTOR), gray_origin_px=PerAxis(-4.5, -19.5))

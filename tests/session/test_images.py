@@ -15,10 +15,13 @@ from slviewer.errors import InputError
 from slviewer.session.importers.images import (
     INTERPRETATION_TAG,
     ORIENTATION_TAG,
+    REDUCED,
+    SUBFILE_TAG,
     read_frames,
     read_image,
     warn_of_unread,
 )
+from slviewer.session.importers.imported import explain_stacks, images_by_name
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
 FORMATS = [".png", ".jpg", ".bmp", ".tif", ".pgm"]
@@ -78,33 +81,57 @@ def test_an_alpha_channel_is_left_aside_and_named(tmp_path, suffix):
     assert path.name in warning and "alpha" in warning and plain.name not in warning
 
 
+def write_tiff(path, pages, further):
+    """Write the images of a TIFF, each with further tags."""
+    data, link = bytearray(b"II*\0\0\0\0\0"), 4
+    for pixels, own in zip(pages, further, strict=True):
+        height, width = pixels.shape
+        tags = {256: width, 257: height, 258: 8 * pixels.itemsize, 259: 1, INTERPRETATION_TAG: 1}
+        tags |= {273: len(data), 277: 1, 278: height, 279: pixels.nbytes, **own}
+        data += pixels.tobytes()
+        data[link : link + 4] = struct.pack("<I", len(data))
+        data += struct.pack("<H", len(tags))
+        data += b"".join(struct.pack("<HHII", tag, 4, 1, tags[tag]) for tag in sorted(tags))
+        link = len(data)
+        data += bytes(4)
+    path.write_bytes(data)
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize("interpretation", [0, 1])
 def test_a_tiff_whose_zero_is_white_is_read_as_it_is_shown(tmp_path, bits, interpretation):
     pixels = (257 * PIXELS.astype(int) >> (16 - bits)).astype(f"uint{bits}")
-    height, width = pixels.shape
-    tags = [
-        (256, width),
-        (257, height),
-        (258, bits),
-        (259, 1),
-        (INTERPRETATION_TAG, interpretation),
-    ]
-    tags += [(273, 8), (277, 1), (278, height), (279, pixels.nbytes)]
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
-    directory = struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0)
-    head = b"II*\0" + struct.pack("<I", 8 + pixels.nbytes)
-    (tmp_path / "a.tif").write_bytes(head + pixels.tobytes() + directory)
+    write_tiff(tmp_path / "a.tif", [pixels], [{INTERPRETATION_TAG: interpretation}])
     shown = pixels if interpretation else np.invert(pixels)
     np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), shown)
 
 
-def test_further_images_in_a_file_are_named(tmp_path):
-    path, pages = tmp_path / "a.tif", [Image.fromarray(PIXELS), Image.fromarray(PIXELS[::-1])]
+def test_pages_are_read_in_order_without_thumbnails(tmp_path):
+    """TIFF of five pages of 16 bits, of which the second is a thumbnail and one is turned."""
+    pages = [(PIXELS.astype(np.uint16) << 4) + k for k in range(5)]
+    stack = tmp_path / "stack.tif"
+    tags = [{}, {SUBFILE_TAG: REDUCED}, {}, {ORIENTATION_TAG: 3}, {}]
+    write_tiff(stack, pages, tags)
+    names = [f"stack_{n:03d}.tif" for n in range(1, 5)]
+    assert [path.name for path in images_by_name(tmp_path)] == names
+    read = read_frames(images_by_name(tmp_path)).stack
+    np.testing.assert_array_equal(read, [pages[k] for k in (0, 2, 3, 4)])
+    np.testing.assert_array_equal(read_image(stack / names[2]), pages[3])
+    assert warn_of_unread(images_by_name(tmp_path)) == []
+    for absent in (stack, stack / "stack_005.tif"):
+        with raises(InputError, absent.name):
+            read_image(absent)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".png"])
+def test_files_of_several_images_are_refused(tmp_path, suffix):
+    path, pages = tmp_path / f"a{suffix}", [Image.fromarray(PIXELS), Image.fromarray(PIXELS[::-1])]
     pages[0].save(path, save_all=True, append_images=pages[1:])
-    np.testing.assert_array_equal(read_image(path), PIXELS)
-    (warning,) = warn_of_unread([path])
-    assert path.name in warning and "first of several" in warning
+    with raises(InputError, path.name, "2"):
+        read_image(path)
+    (tmp_path / "b.tif").write_bytes(encoded(".tif"))  # beside which the pages are not the frames
+    assert [each.name for each in images_by_name(tmp_path)] == [path.name, "b.tif"]
+    assert f"{path.name} holds 2" in explain_stacks([tmp_path])
 
 
 def test_a_damaged_png_is_refused(tmp_path):

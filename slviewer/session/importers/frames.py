@@ -38,7 +38,9 @@ bits = 7
 A long sequence is shorter in groups, `[[frames]]` in place of `[[frame]]`. The files of a group are
 one pattern, in natural order of the names (2 before 10, and what counts in hexadecimal, in letters,
 or on from a camera's 9999, as it counts), or a list. With `order = "name"` at the top no entry
-names files: all images of a folder are taken in natural order of their names.
+names files: all images of a folder are taken in natural order of their names. The images in a TIFF
+of several count as files where it is the only image of the folder, or the only one that a pattern
+matches.
 
 ```toml
 projector = "1280x800"
@@ -92,7 +94,7 @@ from slviewer.fringe.sequence import (
     Size,
     parse_size,
 )
-from slviewer.session.importers.images import Channel
+from slviewer.session.importers.images import Channel, file_of
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,
@@ -424,7 +426,7 @@ def _read(
             files = described.second.select_files(folder)
             recording = replace(recording, second=replace(recording, files=files))
             files += recording.files
-        unknown = sorted(set(images_by_name(folder)) - set(files))
+        unknown = sorted(set(images_by_name(folder)) - set(files) - set(map(file_of, files)))
         return replace(recording, unknown=tuple(unknown)), []
 
     files = described.groups[0].files

@@ -9,7 +9,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import Frame, Size, parse_size
 from slviewer.session.importers.guess import Guess, guess_sequence
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
-from slviewer.session.importers.imported import images_by_name, list_folders
+from slviewer.session.importers.imported import explain_stacks, images_by_name, list_folders
 from slviewer.session.names import join_names
 from slviewer.session.toml import format_value, table_lines
 
@@ -36,12 +36,13 @@ def guess_description(
     cannot belong to one capture (other sizes, damaged).
     """
     source, files = folder, list[Path]()
-    for folder in list_folders(source):
+    folders = list_folders(source)
+    for folder in folders:
         if len(files := images_by_name(folder)) >= 3:
             break
     else:
         raise InputError(
-            f"{source} and the folders in it hold fewer than three images",
+            f"{source} and the folders in it hold fewer than three images{explain_stacks(folders)}",
             "give the folder of a capture",
         )
     images = read_frames(files, channel=channel or DEFAULT_CHANNEL)

@@ -19,7 +19,13 @@ from slviewer.errors import InputError
 from slviewer.fringe.layout import clip_level
 from slviewer.fringe.raw_image import RAW_SUFFIXES, develop
 from slviewer.session.names import join_names
-from slviewer.session.reading import MAX_IMAGE_BYTES, read_file, read_input
+from slviewer.session.reading import (
+    MAX_CLOUD_BYTES,
+    MAX_IMAGE_BYTES,
+    open_regular,
+    read_file,
+    read_input,
+)
 
 IMAGE_SUFFIXES = RAW_SUFFIXES | {
     ".png",
@@ -41,10 +47,17 @@ _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
 # Pillow reads headers alone here: `MAX_PIXELS` limits what is decoded, and faults are reported
 Image.MAX_IMAGE_PIXELS = None
 warnings.filterwarnings("ignore", module=r"PIL\.")
+_TIFF_SUFFIXES = {".tif", ".tiff"}
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHECKED = (_PNG, b"\xff\xd8", b"BM")
 """Beginnings of PNG, JPEG and BMP files, which OpenCV may decode as far as they go."""
-ORIENTATION_TAG, INTERPRETATION_TAG = 274, 262
+SUBFILE_TAG, ORIENTATION_TAG, INTERPRETATION_TAG = 254, 274, 262
+SEVERAL = (
+    "save each as a file of its own, or all as a TIFF that is the only image of its folder, or the"
+    " only one of its pattern in a TOML"
+)
+REDUCED = 1
+"""Bit of the tag of a subfile: a thumbnail, or a level of a pyramid."""
 WHITE_IS_ZERO = 0
 """Of the tag of interpretation; OpenCV turns such images of 8 bits round, and those of 16 not."""
 _TURNS_BACK: Mapping[int, Callable[[np.ndarray], np.ndarray]] = {
@@ -90,7 +103,9 @@ def read_frames(
     decoding can see. Raises InputError, naming the file, for an image that is missing, cut short,
     damaged, of another size or bit depth than the first.
     """
-    first = read_image(paths[0])
+    several = {path.parent for path in paths} & {file_of(path) for path in paths}
+    stacks = {each: read_input(each, MAX_CLOUD_BYTES, "divide it") for each in several}
+    first = read_image(paths[0], stacks.get(paths[0].parent))
     try:
         stack = np.empty((len(paths), *first.shape[:2]), first.dtype)
     except MemoryError as error:
@@ -102,7 +117,8 @@ def read_frames(
 
     def read(index: int) -> None:
         """Read image ``index`` into the stack, and the texture if it is the colour frame."""
-        image = first if index == 0 else read_image(paths[index])
+        path = paths[index]
+        image = first if index == 0 else read_image(path, stacks.get(path.parent))
         mine, firsts = _short_path(paths[index]), _short_path(paths[0])
         if image.shape[:2] != first.shape[:2]:
             raise InputError(
@@ -124,7 +140,7 @@ def read_frames(
 
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(read, range(len(paths))))
-    if full_scale is None and stack.dtype == np.uint16:
+    if full_scale is None and stack.dtype == np.uint16 and not stacks:
         full_scale = _stated_full_scale(paths[0], stack)
     return FrameImages(stack, texture[0] if texture else None, bool(in_colour.any()), full_scale)
 
@@ -170,20 +186,66 @@ def reduce_channels(
     return luma
 
 
-def read_image(path: Path) -> np.ndarray:
+def list_pages(path: Path) -> list[Path]:
+    """Return a path for each image of a TIFF that holds several, as if the file were a folder of
+    them; the path alone for other files."""
+    count = count_images(path) if path.suffix.lower() in _TIFF_SUFFIXES else 1
+    digits = max(3, len(str(count)))
+    pages = [path / f"{path.stem}_{n:0{digits}d}{path.suffix}" for n in range(1, count + 1)]
+    return pages if count > 1 else [path]
+
+
+def file_of(path: Path) -> Path:
+    """Return the file that an image of `list_pages` is in, else the path."""
+    is_page = path.parent.suffix.lower() in _TIFF_SUFFIXES and path.parent.is_file()
+    return path.parent if is_page else path
+
+
+def count_images(path: Path) -> int:
+    """Return how many images a TIFF, a PNG or a GIF holds, without thumbnails; 1 for other files,
+    and for damaged ones."""
+    with (
+        suppress(Exception),  # a malformed file may make Pillow fail in any way
+        open_regular(path) as file,
+        Image.open(file, formats=("TIFF", "PNG", "GIF")) as image,
+    ):
+        return len(_find_pages(image))
+    return 1
+
+
+def _find_pages(image: Image.Image) -> list[int]:
+    """Return the numbers of the images in an open file, without thumbnails."""
+    count = getattr(image, "n_frames", 1)
+    if image.format != "TIFF" or count == 1:
+        return list(range(count))
+    pages = []
+    for number in range(count):
+        image.seek(number)
+        if not image.tag_v2.get(SUBFILE_TAG, 0) & REDUCED:  # type: ignore[attr-defined]
+            pages.append(number)
+    return pages
+
+
+def read_image(path: Path, data: bytes | None = None) -> np.ndarray:
     """(h, w) or (h, w, 3) BGR, uint8 or uint16, without an alpha channel, in the rows and columns
-    of the sensor, however the camera was turned (EXIF). Raises InputError for anything that is not
-    wholly an image."""
-    data, name = read_input(path, MAX_IMAGE_BYTES, "check the file"), _short_path(path)
+    of the sensor, however the camera was turned (EXIF). ``data``: the content of the file, by
+    default read. Raises InputError for anything that is not wholly an image, and for several."""
+    file, name = file_of(path), _short_path(path)
+    data = data or read_input(file, MAX_IMAGE_BYTES, "check the file")
     if not data:
         raise InputError(f"{name} is empty", "copy or record it again")
     if is_raw(path):
         return cv2.cvtColor(develop(data, name, MAX_PIXELS).rgb, cv2.COLOR_RGB2BGR)
-    orientation, interpretation = _check_header(data, name)
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (cv2.error, MemoryError):
-        pixels = None
+    page = None if file == path else int(path.stem.rpartition("_")[2]) - 1
+    header = _check_header(data, name, page)
+    buffer, number = np.frombuffer(data, np.uint8), header.number
+    pixels: np.ndarray | None = None
+    with suppress(cv2.error, MemoryError):
+        if number:
+            chosen = cv2.imdecodemulti(buffer, cv2.IMREAD_UNCHANGED, range=(number, number + 1))[1]
+            pixels = chosen[0] if len(chosen) == 1 else None
+        else:
+            pixels = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise InputError(f"{name} is not a readable image", "copy or record it again")
     if pixels.dtype not in (np.uint8, np.uint16):
@@ -192,22 +254,36 @@ def read_image(path: Path) -> np.ndarray:
         )
     if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
         raise InputError(f"{name} has {pixels.shape[2]} channels", "save frames in grey or RGB")
-    if interpretation == WHITE_IS_ZERO and pixels.dtype == np.uint16:
+    if header.interpretation == WHITE_IS_ZERO and pixels.dtype == np.uint16:
         pixels = np.invert(pixels)
-    pixels = _TURNS_BACK.get(orientation or 0, np.asarray)(pixels)
+    pixels = _TURNS_BACK.get(header.orientation or 0, np.asarray)(pixels)
     return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., :3])
 
 
-def _check_header(data: bytes, name: str) -> tuple[int | None, int | None]:
-    """Return orientation and interpretation of a TIFF, each None where it states none, and for
-    other formats: OpenCV turns none of these. Raises InputError for what is too large, or cut
-    short."""
+@dataclass(frozen=True)
+class _Header:
+    """The ``number`` of an image in its file; of a TIFF ``orientation`` and ``interpretation``,
+    None where it states none, and for other formats: OpenCV turns none of these."""
+
+    number: int = 0
+    orientation: int | None = None
+    interpretation: int | None = None
+
+
+def _check_header(data: bytes, name: str, page: int | None) -> _Header:
+    """Return the header of the only image, or of ``page`` among several. Raises InputError for
+    what is too large or cut short, for several images, and for a page that is not there."""
     width = height = 0
-    tags: Mapping[int, int] = {}
+    header, pages = _Header(), [0]
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+            if image.format in ("TIFF", "PNG"):
+                pages = _find_pages(image)
+            if image.format == "TIFF" and page in (None, *range(len(pages))):
+                image.seek(number := pages[page or 0])
+                tags = image.tag_v2  # type: ignore[attr-defined]
+                header = _Header(number, tags.get(ORIENTATION_TAG), tags.get(INTERPRETATION_TAG))
             width, height = image.size
-            tags = image.getexif() if image.format == "TIFF" else {}
             if width * height <= MAX_PIXELS and data.startswith(_CHECKED):
                 (image.verify if data.startswith(_PNG) else image.load)()
     except Exception as error:  # a malformed file may make Pillow fail in any way
@@ -215,27 +291,31 @@ def _check_header(data: bytes, name: str) -> tuple[int | None, int | None]:
             raise InputError(
                 f"{name} is damaged or cut short ({error})", "copy or record it again"
             ) from error
+    if page is None and len(pages) > 1:
+        raise InputError(f"{name} holds {len(pages)} images", SEVERAL)
+    if page is not None and page >= len(pages):
+        raise InputError(f"{name} is not in its file", "copy or record it again")
     if width * height > MAX_PIXELS:
         raise InputError(
             f"{name} is {width}x{height} px, and images of up to {MAX_PIXELS / 1e6:.0f} megapixels"
             " are read",
             "crop it, or record it at a lower resolution",
         )
-    return tags.get(ORIENTATION_TAG), tags.get(INTERPRETATION_TAG)
+    return header
 
 
 def warn_of_unread(paths: Sequence[Path]) -> list[str]:
-    """Warnings that images have a channel, or files further images, that `read_image` leaves aside,
-    by their headers."""
+    """Warnings that images have a channel, or JPEG files further images, that `read_image` leaves
+    aside, by their headers."""
     transparent, paged = [], []
-    for path in paths:
+    for path in dict.fromkeys(map(file_of, paths)):
         with (
             suppress(OSError, SyntaxError, ValueError),
             Image.open(path, formats=_FORMATS) as image,
         ):
             if image.mode in ("LA", "PA", "RGBA"):
                 transparent.append(path.name)
-            if getattr(image, "n_frames", 1) > 1:
+            if image.format not in ("TIFF", "PNG") and getattr(image, "n_frames", 1) > 1:
                 paged.append(path.name)
     listed = {
         "transparency (an alpha channel) is ignored": transparent,

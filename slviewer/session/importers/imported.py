@@ -16,8 +16,12 @@ from slviewer.session.capture import NewCapture
 from slviewer.session.importers.images import (
     DEFAULT_CHANNEL,
     IMAGE_SUFFIXES,
+    SEVERAL,
     Channel,
+    count_images,
+    file_of,
     is_raw,
+    list_pages,
     read_frames,
     warn_of_unread,
 )
@@ -204,8 +208,9 @@ def match_files(folder: Path, pattern: str) -> list[Path]:
 
 
 def images_by_name(folder: Path, pattern: re.Pattern[str] = re.compile("")) -> list[Path]:
-    """The images of a folder whose name matches, in `natural_order` of their names. Of a
-    RAW file and an image that the camera made of it, the RAW file alone."""
+    """The images of a folder whose name matches, in `natural_order` of their names. Of a RAW file
+    and an image that the camera made of it, the RAW file alone. The only image is its pages, as
+    `list_pages` names them, where it is a TIFF of several."""
     images = [
         entry
         for entry in visible(folder)
@@ -213,7 +218,18 @@ def images_by_name(folder: Path, pattern: re.Pattern[str] = re.compile("")) -> l
     ]
     raw = {file.stem for file in images if is_raw(file)}
     chosen = [file for file in images if is_raw(file) or file.stem not in raw]
+    if len(chosen) == 1:
+        return list_pages(chosen[0])
     return [folder / name for name in natural_order([file.name for file in chosen])]
+
+
+def explain_stacks(folders: Sequence[Path]) -> str:
+    """Return what could be done about files of several images in folders, as a sentence; "" where
+    there are none."""
+    for file in (entry for folder in folders for entry in sorted(visible(folder))):
+        if file.suffix.lower() in (".gif", *IMAGE_SUFFIXES) and (count := count_images(file)) > 1:
+            return f". {file.name} holds {count} images: {SEVERAL}"
+    return ""
 
 
 def match_images(
@@ -295,7 +311,7 @@ def collect_captures(
     if not captures:
         raise InputError(
             f"{source} holds no captures: {looks_like} was looked for in it and in the folders"
-            " inside"
+            f" inside{explain_stacks([source, *inner])}"
         )
     recordings, warnings, skipped = [], [], []
     stems = {_name_pattern(folder) for folder in captures}
@@ -362,7 +378,7 @@ def _find_pair(recording: ImportableRecording) -> ImportableRecording | None:
     """Return a recording of the first camera with that of the second; None for others."""
     for is_first, second in _CAMERAS:
         files = tuple(_name_alike(file, is_first, second) for file in recording.files)
-        if files and all(file.is_file() for file in files):
+        if files and all(file_of(file).is_file() for file in files):
             name = is_first.sub("", recording.name).strip("_- ") or recording.source.parent.name
             other = replace(recording, files=files, source=files[0].parent)
             return replace(recording, name=plain_name(name, "capture"), second=other)
@@ -372,14 +388,15 @@ def _find_pair(recording: ImportableRecording) -> ImportableRecording | None:
 def _name_alike(file: Path, is_first: re.Pattern[str], second: str) -> Path:
     """Return where the second camera's image of a file of the first is: the name of the file, else
     of its folder, names the other camera in the same case. The folder of a file without one."""
-    for part in (file, file.parent):
+    own = file_of(file)
+    for part in (own, own.parent):
         if found := is_first.search(part.name):
             written = second.upper() if found[0].isupper() else second
             if found[0].istitle() and len(second) > 1:
                 written = second.capitalize()
             name = part.name[: found.start()] + written + part.name[found.end() :]
             return part.parent.joinpath(name, *file.relative_to(part).parts)
-    return file.parent
+    return own.parent
 
 
 def none_usable(skipped: Sequence[Skipped]) -> InputError:

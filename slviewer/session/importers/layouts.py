@@ -56,6 +56,7 @@ from slviewer.session.importers.imported import (
     check_complete,
     collect_captures,
     define_layout,
+    explain_stacks,
     has_images,
     images_by_name,
     list_folders,
@@ -488,7 +489,7 @@ def detect_layout(source: Path) -> str:
         )
     known = "; ".join(f"{layout.name}: {layout.holds}" for layout in layouts().values())
     raise UnknownLayoutError(
-        f"{source} has none of the known layouts ({known})",
+        f"{source} has none of the known layouts ({known}){explain_stacks(folders)}",
         "describe the images in a TOML in the folder",
     )
 
