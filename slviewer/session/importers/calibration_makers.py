@@ -17,7 +17,7 @@ _ALONE = "calibrate the camera alone with --camera-only"
 _SAVE = 'save it with np.savez("camera.npz", mtx=..., dist=..., image_size=(width, height))'
 _EXPORT = "save the camera as Agisoft XML (Tools, Camera Calibration, Adjusted)"
 _UNREAD = (
-    ((".pkl", ".pickle", ".p"), b"\x80", "a pickle of Python, which can run programs", _SAVE),
+    ((".pkl", ".pickle"), b"", "a pickle of Python, which can run programs", _SAVE),
     ((".npy",), b"\x93NUMPY", "a single array of NumPy", _SAVE),
     ((".cal", ".dat"), b"ParGroup", "of HALCON, whose lens models are other ones", _ALONE),
     (("cameras.bin",), b"", "a binary of COLMAP", "convert it: colmap model_converter --output_type"
@@ -133,9 +133,10 @@ def _to_number(text: str) -> float | str | None:
 
 def convert_json(tree: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the entries of the only camera in a JSON of calib.io; other trees unchanged. Raises
-    InputError for several cameras and other models, and for scenes of Meshroom."""
+    InputError for several cameras and other models, and for scenes of Meshroom and OpenMVG."""
     if isinstance(tree.get("intrinsics"), list) and {"views", "poses"} & tree.keys():
-        raise InputError("it is a scene of Meshroom (AliceVision), which is not read", _ALONE)
+        maker = "OpenMVG" if "sfm_data_version" in tree else "Meshroom (AliceVision)"
+        raise InputError(f"it is a scene of {maker}, which is not read", _ALONE)
     parts = tree.get("Calibration")
     if not isinstance(parts, Mapping) or not isinstance(cameras := parts.get("cameras"), list):
         return tree

@@ -246,7 +246,7 @@ _PROJECT = b'<?xml version="1.0"?>\n<document version="1.2.0" path="{projectname
 _PAIR = {"mtx": np.eye(3), "dist": np.zeros(5)}
 _UNREAD: Mapping[str, tuple[bytes, str]] = {
     "a.pkl": (pickle.dumps(_PAIR, 4), "pickle"),
-    "b.pickle": (pickle.dumps(_PAIR, 2), "pickle"),
+    "b.pickle": (pickle.dumps(_PAIR, 0), "pickle"),
     "a.npy": (_to_npy(np.array(_PAIR, dtype=object)), "NumPy"),
     "a.cal": (_HALCON.encode(), "HALCON"),
     "a.dat": (_HALCON.encode(), "HALCON"),
@@ -256,6 +256,7 @@ _UNREAD: Mapping[str, tuple[bytes, str]] = {
     "a.xml": (_PROJECT, "Metashape"),
     "cameras.sfm": (json.dumps(_SCENE).encode(), "Meshroom"),
     "a.json": (json.dumps(_SCENE).encode(), "Meshroom"),
+    "sfm_data.json": (json.dumps({"sfm_data_version": "0.3", **_SCENE}).encode(), "OpenMVG"),
 }
 """Files that are refused, with the word that names what they are."""
 
