@@ -97,7 +97,10 @@ def identify_keys(storage: Storage) -> tuple[str, ...]:
         raise InputError(
             f"{storage.name} holds {' and '.join(', '.join(row) for row in matches)}", remedy
         )
-    raise InputError(f"the entries of {storage.name} have no names that are known here", remedy)
+    raise InputError(
+        f"the entries of {storage.name} have no names that are known here",
+        f"{remedy}. A file of one camera is for calibrate --camera",
+    )
 
 
 def read_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
