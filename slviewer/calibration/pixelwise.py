@@ -24,9 +24,10 @@ from slviewer.fringe.image_area import ImageArea
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel, run_rows
-from slviewer.geometry.rigid import Floats, Floats32
+from slviewer.geometry.rigid import Floats, Floats32, move_points
 from slviewer.geometry.shapes import Plane, fit_plane
 from slviewer.geometry.triangulation import MARGIN, depth_per_px, ray_depth, triangulate_pixels
+from slviewer.geometry.vectors import diagonal, lengths
 from slviewer.records.calibration import AxisFit, PixelwiseFit
 from slviewer.records.record import from_plain
 
@@ -37,6 +38,9 @@ BAND_BYTES = 2**27
 """Memory for the band of image rows that is fitted at a time; the band is narrower the more poses
 there are."""
 MIN_POSES = 4
+SAME_PLACE = 0.01
+"""Largest distance of a feature from its place in another pose, over the board's diagonal, with
+which the board did not move between them: 2 mm of 225."""
 """One pose more than coefficients, so that the fit's RMS is meaningful."""
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better
@@ -52,8 +56,8 @@ class PixelFit:
     mm, or NaN.
 
     ``rms_mm`` (3, h, w): RMS residuals in z, x and y; ``poses`` (h, w): number of poses of each
-    pixel; ``phase_min`` and ``phase_max`` (h, w) rad: their phase range; ``condition`` (h, w):
-    condition number of the fit of eq. 9.
+    pixel, those at one place counted once; ``phase_min`` and ``phase_max`` (h, w) rad: their phase
+    range; ``condition`` (h, w): condition number of the fit of eq. 9.
     """
 
     coefficients: Floats
@@ -206,11 +210,12 @@ def calibrate_pixelwise(
     band = max(1, min(height, BAND_BYTES // (8 * len(used) * width * (len(axes) + 1))))
     # allocated once: new memory is slow at first
     buffer = np.empty((len(axes) + 1, len(used) * band * width))
+    twins = list_twins(used, stereo)
     for first in range(0, height, band):
         rows = slice(first, min(first + band, height))
         phases, z, sums = _collect_rows(model, used, stereo, rows, buffer)
         for axis, phase in zip(axes, phases, strict=True):
-            _fit_rows(model, axis, stereo, rows, (phase, z, sums))
+            _fit_rows(model, axis, stereo, rows, (phase, z, sums), twins)
         if progress:
             progress(rows.stop / height)
     if not any((fit.poses >= MIN_POSES).any() for fit in model.fits.values()):
@@ -219,6 +224,25 @@ def calibrate_pixelwise(
             "let the poses overlap in the image",
         )
     return model
+
+
+def list_twins(used: Sequence[Observation], stereo: StereoModel) -> np.ndarray:
+    """Return of each pose the last one before it at the same place, (n,) int64; -1 without any.
+
+    What a pose at the place of another shows of a pixel's curve is the same: two places that were
+    captured twice are no four.
+    """
+    boards = [move_points(stereo.poses[o.name], o.points) for o in used]
+    twins = np.full(len(used), -1)
+    for k, board in enumerate(boards):
+        limit = SAME_PLACE * diagonal(board)
+        same = [
+            i
+            for i, other in enumerate(boards[:k])
+            if other.shape == board.shape and lengths(other - board).max() < limit
+        ]
+        twins[k] = max(same, default=-1)
+    return twins
 
 
 def pixel_samples(
@@ -354,8 +378,10 @@ def _fit_rows(
     stereo: StereoModel,
     rows: slice,
     samples: tuple[np.ndarray, np.ndarray, np.ndarray],
+    twins: np.ndarray,
 ) -> None:
-    """Fill the ``rows`` of an axis' fit from its ``samples`` by ``_collect_rows`` (step 5).
+    """Fill the ``rows`` of an axis' fit from its ``samples`` by ``_collect_rows`` (step 5);
+    ``twins``: by ``list_twins``.
 
     The reference of each pixel is the phase that stereo predicts at mid depth; 0 outside the
     projector's image.
@@ -372,6 +398,7 @@ def _fit_rows(
         phase.shape[1],
         phase,
         z,
+        twins,
         phase_ref,
         z_ref,
         MIN_POSES,
@@ -469,6 +496,7 @@ def fit_rational(
     last,
     phase,
     z,
+    twins,
     phase_ref,
     z_ref,
     min_poses,
@@ -480,7 +508,7 @@ def fit_rational(
     condition,
 ):
     """Fit pixels of some rows to their poses: phase (n, h', w) rad and depth z (n, h', w) mm, NaN
-    where invalid.
+    where invalid; ``twins`` (n,): by ``list_twins``.
 
     Fills ``coefficients`` (3, h', w) a0 ... a2 and ``rms`` mm, NaN at pixels of fewer than
     ``min_poses`` poses; ``poses``, the range of valid ``phase``, and the fit's ``condition``, (h',
@@ -492,9 +520,10 @@ def fit_rational(
         for u in range(phase.shape[2]):
             reference = phase_ref[v, u]
             count, low, high = _sum_linear_moments(phase, z, v, u, reference, z_ref, a)
-            poses[v, u], phase_min[v, u], phase_max[v, u] = count, low, high
+            places = count - _count_twins(phase, z, v, u, twins)
+            poses[v, u], phase_min[v, u], phase_max[v, u] = places, low, high
             a0 = a1 = a2 = residual = scaled_condition = np.nan
-            if count >= min_poses:
+            if places >= min_poses:
                 a0, a1, a2, _, _ = _solve_moments(a)
                 if not np.isnan(a0):
                     _sum_gauss_newton_moments(phase, z, v, u, reference, z_ref, a0, a1, a2, a)
@@ -503,6 +532,21 @@ def fit_rational(
                     residual = np.sqrt(max(0.0, a[9] - explained) / count)
             coefficients[0, v, u], coefficients[1, v, u], coefficients[2, v, u] = a0, a1, a2
             rms[v, u], condition[v, u] = residual, scaled_condition
+
+
+@njit
+def _count_twins(phase, z, v, u, twins):
+    """Return how many of a pixel's valid poses have a valid one before them at the same place."""
+    count = 0
+    for i in range(len(twins)):
+        if twins[i] < 0 or not np.isfinite(phase[i, v, u] + z[i, v, u]):
+            continue
+        j = twins[i]
+        while j >= 0 and not np.isfinite(phase[j, v, u] + z[j, v, u]):
+            j = twins[j]
+        if j >= 0:
+            count += 1
+    return count
 
 
 @njit

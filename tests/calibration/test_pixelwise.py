@@ -134,6 +134,19 @@ def test_too_few_poses_are_rejected() -> None:
         calibrate_pixelwise(OBSERVATIONS[:3], stereo)
 
 
+def test_places_captured_twice_count_once() -> None:
+    poses = board_poses(5)
+    once = [observation(TRUE, T, f"pose_{k}", 0.01) for k, T in enumerate(poses)]
+    again = [observation(TRUE, T, f"again_{k}", 0.01) for k, T in enumerate(poses)]
+    models = [
+        calibrate_pixelwise(each, calibrate_stereo(each, PROJECTOR, str(BOARD)))
+        for each in (once, once + again)
+    ]
+    first, twice = (each.fits["x"].poses.astype(int) for each in models)
+    assert first.max() == twice.max() == 5
+    assert np.count_nonzero(first != twice) < 0.01 * first.size
+
+
 def test_moments_find_an_exact_rational_function() -> None:
     """Noise-free data of the form itself come back to rounding, whatever the reference point."""
     phi = np.linspace(100, 130, 9)
@@ -151,6 +164,7 @@ def test_moments_find_an_exact_rational_function() -> None:
         1,
         phi.reshape(9, 1, 1),
         z.reshape(9, 1, 1),
+        np.full(9, -1),
         reference,
         600.0,
         4,
