@@ -32,10 +32,11 @@ from slviewer.calibration.splined.residual_noise import (
     robust_weights,
 )
 from slviewer.calibration.splined.residuals import PoseData
-from slviewer.calibration.splined.unknowns import CELLS_ACROSS, State, board_frame
+from slviewer.calibration.splined.unknowns import CELLS_ACROSS, State, board_frame, long_side
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.fringe.image_area import ImageArea
+from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.vectors import shared_rms
 
@@ -120,7 +121,7 @@ def adjust_bundle(
     names, data, sample_sigma = gather_data(observations, stereo)
     T = np.array([stereo.poses[name] for name in names])
     area = combine_observed(observations)
-    camera_cells = _count_camera_cells(area, cells_across, beside)
+    camera_cells = _count_camera_cells(stereo.rig.camera, area, cells_across, beside)
     state = State.from_rig(stereo.rig, T, len(data.points), cells_across, camera_cells)
     layout = state.layout
     state, held, prior = _hold(state, data, stereo, beside, names)
@@ -217,17 +218,18 @@ def _depth_range(state: State, data: PoseData, is_excluded: Mask) -> tuple[float
 
 
 def _count_camera_cells(
-    area: ImageArea | None, cells_across: int | None, beside: Bundle | None
+    lens: Lens, area: ImageArea | None, cells_across: int | None, beside: Bundle | None
 ) -> int:
-    """Return the number of cells across the camera's image, as wide as ``cells_across`` across its
-    ``area`` are; those of the adjustment ``beside``, if there is one."""
+    """Return the number of cells along the longer side of the camera's image, as long as
+    ``cells_across`` along its ``area`` are; those of the adjustment ``beside``, if there is one."""
+    side = long_side(lens)
     if beside is not None:
-        return beside.state.rig.camera.coefficients.shape[2] - 3
+        return beside.state.rig.camera.coefficients.shape[2 - side] - 3
     across = CELLS_ACROSS if cells_across is None else cells_across
     if area is None:
         return across
-    u0, _, u1, _ = area.bounds
-    return round(across * min(area.size[0] / (u1 - u0), MOST_CELLS_FACTOR))
+    first, last = area.bounds[side], area.bounds[2 + side]
+    return round(across * min(area.size[side] / (last - first), MOST_CELLS_FACTOR))
 
 
 def _hold(

@@ -62,11 +62,22 @@ class Device(NamedTuple):
 
     @classmethod
     def from_lens(cls, lens: Lens, cells_across: int | None) -> "Device":
-        """Return a lens's device with W = 0, on square cells, ``CELLS_ACROSS`` by default."""
+        """Return a lens's device with W = 0, on square cells; ``cells_across``: of its longer side,
+        ``CELLS_ACROSS`` by default."""
         across = CELLS_ACROSS if cells_across is None else cells_across
-        width, height = lens.size
-        down = int(np.clip(round(across * height / width), 6, 2 * across))
-        return cls(lens.parameters, np.zeros((2, down + 3, across + 3)), np.array(lens.size, float))
+        cells, side = np.full(2, across), long_side(lens)
+        other = across * lens.size[1 - side] / lens.size[side]
+        cells[1 - side] = np.clip(round(other), 6, 2 * across)
+        columns, rows = cells.tolist()
+        size = np.array(lens.size, float)
+        return cls(lens.parameters, np.zeros((2, rows + 3, columns + 3)), size)
+
+
+def long_side(lens: Lens) -> int:
+    """Return 0 where a lens sees more along its image's width, 1 along its height; a camera on its
+    side has the same cells as one upright."""
+    wide, high = np.array(lens.size) / np.diag(lens.K)[:2]
+    return int(high > wide)
 
 
 def roughness(coefficients: Floats) -> Floats:
