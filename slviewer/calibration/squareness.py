@@ -1,8 +1,10 @@
-"""Whether a camera's pixels and a board's cells are square.
+"""Whether a camera's pixels and a board's cells are square, and a projector's rows and columns are
+at right angles.
 
 A print that is stretched in one direction gives a camera focal lengths that differ in x and y, as
 pixels that are not square do; nearly all cameras have square ones. Only tilts of the board tell the
-two apart, or the projector, which sees the same print.
+two apart, or the projector, which sees the same print. Rows and columns that are not at right
+angles are no projector's: its image is moved at the corners, as a correction of keystone does.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,8 +16,9 @@ from scipy.special import stdtrit
 
 from slviewer.calibration.board_pose import solve_device
 from slviewer.errors import InputError
+from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.rigid import Floats, move_points
 from slviewer.geometry.vectors import finite_rows
 from slviewer.records.verdict import Finding
 from slviewer.target.board import Board
@@ -27,8 +30,13 @@ DOUBT = 1e-4
 """Probability that an estimate differs from its true value by more than its limit."""
 ASPECTS = (0.5, 1.0, 2.0)
 """Of square pixels, and of the diamond pixels of some DMDs."""
+PROVEN = 5.0
+"""Limits of its error by which the stretch of the print that tilts show is off the other
+explanation: boards that are bent disturb it by more than its limit."""
 MIN_SHARED = 0.25
 """The projector shares the camera's aspect, or not, where its own agrees to this share of it."""
+MIN_SKEW_DEG = 0.5
+"""Angles below it may come from lens distortion, which the fit lacks (0.25 on simulated rigs)."""
 
 _MIN_FEATURES = 6
 """Of a pose, fewer of which its own position explains whatever the pixels are."""
@@ -42,6 +50,7 @@ class Squareness:
     ``aspect``: fy / fx, where the board is as described; ``shear``: of its x by its y. ``stretch``:
     of its y over its x, where the pixels' aspect is free: what the tilts of the poses alone show.
     ``explaining``: the stretch with which the pixels are square, tried; NaN where not estimated.
+    ``skew_deg``: angle by which the projector's rows and columns are not at right angles.
     """
 
     aspect: float
@@ -51,6 +60,8 @@ class Squareness:
     stretch: float = 1.0
     stretch_limit: float = np.inf
     explaining: float = np.nan
+    skew_deg: float = 0.0
+    skew_limit_deg: float = np.inf
 
     @property
     def is_doubtful(self) -> bool:
@@ -58,9 +69,21 @@ class Squareness:
         return abs(self.aspect - 1) > max(MIN_ASPECT_ERROR, self.aspect_limit)
 
     @property
+    def is_sensor_proven(self) -> bool:
+        """Whether the tilts of the poses leave no doubt that the pixels, not the board's cells, are
+        other than square."""
+        off_right, off_print = abs(self.stretch - 1), abs(self.stretch - self.explaining)
+        return self.is_doubtful and off_right < self.stretch_limit < off_print / PROVEN
+
+    @property
     def is_sheared(self) -> bool:
         """Whether the board's rows and columns are not at right angles."""
         return abs(self.shear) > max(MIN_ASPECT_ERROR, self.shear_limit)
+
+    @property
+    def is_skewed(self) -> bool:
+        """Whether the projector's rows and columns are not at right angles."""
+        return abs(self.skew_deg) > max(MIN_SKEW_DEG, self.skew_limit_deg)
 
 
 def measure_squareness(
@@ -106,6 +129,51 @@ def measure_squareness(
     return replace(squareness, explaining=_explain_aspect(kept, lens.size))
 
 
+def measure_skew(
+    points: Sequence[Floats], pixels: Sequence[Floats], projected: Sequence[Floats], size: Size
+) -> tuple[float, float]:
+    """Return by how many degrees the angle between a projector's rows and columns is not right, and
+    the limit that its error exceeds with a probability of `DOUBT`.
+
+    The camera is solved by itself, from ``points`` (n, 3) mm on the board and ``pixels`` (n, 2) of
+    each pose, as the projector's own lens would disturb it; then the projection of what it sees to
+    ``projected`` (n, 2) px of the projector is linear, but for its lens distortion. NaN: excluded.
+    """
+    used = [finite_rows(*each) for each in zip(pixels, projected, strict=True)]
+    kept = [k for k, each in enumerate(used) if np.count_nonzero(each) >= _MIN_FEATURES]
+    X, seen, shown = (
+        [each[k][used[k]].astype(float) for k in kept] for each in (points, pixels, projected)
+    )
+    camera = solve_device("camera", X, seen, size)
+    placed = [move_points(T, each) for T, each in zip(camera.poses, X, strict=True)]
+    far = float(np.abs(np.concatenate(placed)).max())
+    wide = float(np.abs(np.concatenate(shown)).max())
+    rows = [_projection_rows(x / far, px / wide) for x, px in zip(placed, shown, strict=True)]
+    normal = np.array([A.T @ A for A in rows])
+    total = normal.sum(axis=0)
+    skew = _skew_deg(total)
+    fewer = np.array([_skew_deg(total - each) for each in normal])
+    count = len(fewer)
+    sigma = float(np.sqrt((count - 1) / count * np.sum((fewer - fewer.mean()) ** 2)))
+    return skew, -float(stdtrit(count - 1, DOUBT / 2)) * sigma
+
+
+def _projection_rows(X: Floats, pixels: Floats) -> Floats:
+    """Return equations (2 n, 12) of a linear projection (3, 4) of points (n, 3) to pixels (n, 2),
+    all about 1."""
+    near = np.column_stack([X, np.ones(len(X))])
+    u, v = pixels.T[..., None]
+    none = np.zeros_like(near)
+    return np.concatenate([np.hstack([near, none, -u * near]), np.hstack([none, near, -v * near])])
+
+
+def _skew_deg(normal: Floats) -> float:
+    """Return the angle by which rows and columns of the projection are not at right angles."""
+    P = np.linalg.eigh(normal)[1][:, 0].reshape(3, 4)
+    K = cv2.RQDecomp3x3(P[:, :3])[1]
+    return float(np.degrees(np.arctan(K[0, 1] / K[0, 0])))
+
+
 def _fit_jackknife(systems: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
     """Solve the poses' equations (J (m, k), r (m,)) together; return the solution (k,) and the
     limits of its errors, inf where a pose alone determines it."""
@@ -147,9 +215,23 @@ def judge_squareness(
     """Yield findings where the camera's pixels, and the board's cells, are not square.
 
     ``notation``: of the board; ``projector_aspect``: fy / fx of the projector, if there is one.
+    None where the projector's rows and columns are not at right angles, which disturbs the others.
     """
     s = squareness
-    if s.is_doubtful:
+    if s.is_skewed:
+        return
+    if s.is_sensor_proven:
+        yield Finding(
+            "board-size",
+            "note",
+            f"the camera's pixels are {s.aspect:.4f} (+- {s.aspect_limit:.4f}) times as wide as"
+            " high: by the poses' tilts alone, the board's print is right"
+            f" ({s.stretch:.4f} (+- {s.stretch_limit:.4f}) times as long along y, for its length"
+            f" along x, and not {s.explaining:.4f} times)",
+            "see that the camera joins or skips rows or columns by intention, and that no program"
+            " scales its images; nothing else needs to be done",
+        )
+    elif s.is_doubtful:
         yield Finding(
             "board-size",
             "doubtful",

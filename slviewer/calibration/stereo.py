@@ -11,7 +11,7 @@ from slviewer.calibration.board_pose import CRITERIA, solve_device, to_solver_un
 from slviewer.calibration.known_camera import KnownCamera, Views, solve_beside
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.calibration.observe import Observation
-from slviewer.errors import CalibrationRejected
+from slviewer.errors import CalibrationRejected, InputError
 from slviewer.examination.findings import mirroring_remedy
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, Size
@@ -50,6 +50,8 @@ _SAVED_KEYS = {"excluded": "left_out", "features_excluded": "features_set_aside"
 """Keys on disk of the fields whose names differ from them."""
 MIN_POSES = 3
 MIN_TILT_SPREAD_DEG = 4.0
+FORESHORTENED_DEG = 15.0
+"""Difference of tilts, by the boards' shapes, with which they are not parallel."""
 
 
 @dataclass(frozen=True)
@@ -349,7 +351,15 @@ def _solve_both(
         # systematic errors, which the standard deviations lack, change the two fits differently
         change = np.abs(f / np.diag(K) - 1).max()
         sigma[device] = max(sigma[device], float(change * min(K[0, 0], K[1, 1])))
-    rig = StereoRig(Lens(K_c, D_c, sizes[0]), Lens(K_p, D_p, sizes[1]), R, unit * T)
+    try:
+        lenses = Lens(K_c, D_c, sizes[0]), Lens(K_p, D_p, sizes[1])
+    except InputError as error:  # as of boards without perspective, whose focal length is infinite
+        raise CalibrationRejected(
+            f"the poses give the devices lenses that cannot be ({error.observation})",
+            "tilt the board by 15 to 30 degrees in different directions, and use lenses with"
+            " perspective",
+        ) from error
+    rig = StereoRig(*lenses, R, unit * T)
     poses = [transform_from_rvec(r, unit * t) for r, t in zip(rvecs, tvecs, strict=True)]
     return rig, poses, sigma
 
@@ -420,6 +430,8 @@ def check_tilts(used: Sequence[Observation], camera: KnownCamera | None) -> None
         return
     spread = nominal_tilt_spread_deg(used)
     if spread < MIN_TILT_SPREAD_DEG:
+        if (tilt := foreshortened_tilt_deg(used)) >= FORESHORTENED_DEG:
+            raise CalibrationRejected(*describe_telecentric(tilt))
         raise CalibrationRejected(
             f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees)",
             "tilt the board by 15 to 30 degrees, in different directions",
@@ -429,13 +441,58 @@ def check_tilts(used: Sequence[Observation], camera: KnownCamera | None) -> None
 def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
     """Estimate the largest angle in degrees between two boards with a nominal lens; 0 for fewer
     than two boards."""
-    normals = []
-    for o in used:
-        H, _ = cv2.findHomography(o.points[:, :2], o.camera)
-        line = np.linalg.inv(H).T @ np.array([0.0, 0.0, 1.0])
-        normal = nominal_lens(o.size).K.T @ line
-        normals.append(unit_vectors(normal) * np.sign(normal[2] or 1))
+    normals = [_nominal_normal(o, _nominal_homography(o)) for o in used]
     return largest_angle_deg(np.array(normals)) if len(normals) > 1 else 0.0
+
+
+def _nominal_homography(o: Observation) -> Floats:
+    """Return the homography (3, 3) from mm on the board to what a nominal lens makes of pixels."""
+    H, _ = cv2.findHomography(o.points[:, :2], o.camera)
+    return np.asarray(np.linalg.solve(nominal_lens(o.size).K, H))
+
+
+def _nominal_normal(o: Observation, H: Floats) -> Floats:
+    """Return the board's normal (3,) from the line at infinity of its homography."""
+    normal = unit_vectors(np.linalg.inv(H).T @ np.array([0.0, 0.0, 1.0]))
+    return np.asarray(normal * np.sign(normal[2] or 1))
+
+
+def foreshortened_tilt_deg(used: Sequence[Observation]) -> float:
+    """Estimate by how many degrees two boards' tilts differ at least, where their shapes show that
+    and their perspective shows no tilt at all; 0 otherwise.
+
+    A tilt t shortens the image of a board in one direction by cos t. With J the derivative of the
+    image, seen along the normal that perspective shows, J J^T is then the same but for its size for
+    boards that are parallel, turned in their plane or not, whatever the shape of the pixels.
+    """
+    shapes = []
+    for o in used:
+        H = _nominal_homography(o)
+        normal = _nominal_normal(o, H)
+        if np.degrees(np.arccos(min(normal[2], 1.0))) > MIN_TILT_SPREAD_DEG:
+            return 0.0
+        right = unit_vectors(np.cross([0.0, 1.0, 0.0], normal))
+        seen = np.array([right, np.cross(normal, right), normal]) @ H
+        x, y, depth = seen @ [*o.points[:, :2].mean(axis=0), 1.0]
+        J = (seen[:2, :2] - np.outer([x, y], seen[2, :2]) / depth) / depth
+        shapes.append(J @ J.T / abs(np.linalg.det(J)))
+    ratios = [
+        np.linalg.eigvals(np.linalg.solve(one, other)).real.max()
+        for k, one in enumerate(shapes)
+        for other in shapes[:k]
+    ]
+    return float(np.degrees(np.arccos(1 / max(*ratios, 1.0)))) if ratios else 0.0
+
+
+def describe_telecentric(tilt_deg: float) -> tuple[str, str]:
+    """Return what a lens without perspective does to boards whose tilts differ so much, and the
+    remedy."""
+    return (
+        f"the boards are foreshortened as by tilts that differ by {tilt_deg:.0f} degrees, but their"
+        " far sides appear no smaller than their near ones: the camera's lens is telecentric, or"
+        " too long for its distance",
+        "use a lens with perspective; this calibration does not know rays that are parallel",
+    )
 
 
 def check_handedness(used: Sequence[Observation]) -> None:

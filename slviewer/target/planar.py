@@ -158,7 +158,10 @@ def check_grid(board: Board, pixels: Floats, ids: np.ndarray, what: str) -> None
     pixels must agree with a homography and a smooth distortion (``planar.GridMap``), and the
     numbering must be right-handed.
     """
-    advice = "keep the board flat and in focus, without reflections, and take the pose again"
+    advice = (
+        "keep the board flat and in focus, without reflections, and take the pose again; a fisheye"
+        " lens bends every board so: use one that keeps lines nearly straight"
+    )
     points = board.nodes[ids]
     fitted = fit_grid_map(points, pixels)
     areas = np.linalg.det(jacobians(fitted.H, points))

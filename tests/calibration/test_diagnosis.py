@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
@@ -18,6 +19,7 @@ from slviewer.calibration.known_camera import KnownCamera
 from slviewer.calibration.observe import Observation
 from slviewer.fringe.response import gamma_from_harmonic
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import move_points
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.records.record import from_plain, to_plain
 from slviewer.records.verdict import CAUSES, Finding, Verdict
@@ -117,6 +119,54 @@ def test_cells_that_are_not_square_are_named() -> None:
     assert 0.698 < squareness.explaining < 0.702
     assert f"{squareness.explaining:.4f}" in found.verdict.findings[0].observation
     assert "fringe-period" not in found.verdict.causes
+
+
+@pytest.mark.computes
+def test_pixels_that_are_not_square_are_no_fault_where_tilts_prove_them() -> None:
+    K = TRUE.camera.K * np.array([[1], [0.5], [1]])
+    low = dataclasses.replace(TRUE, camera=dataclasses.replace(TRUE.camera, K=K))
+    found = attempt([observation(low, T, f"pose_{k:02d}") for k, T in enumerate(board_poses(9))])
+    (note,) = (each for each in found.verdict.findings if each.cause == "board-size")
+    assert note.severity == "note" and "0.50" in note.observation
+    assert "fringe-period" not in found.verdict.causes
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize(("corner", "level"), [(0.1, "rejected"), (0.02, "doubtful"), (0, "good")])
+def test_a_projector_that_moves_its_corners_is_named(corner: float, level: str) -> None:
+    outer = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32) * np.float32(PROJECTOR)
+    inner = outer.copy()
+    inner[0, 0] += corner * PROJECTOR[0]
+    inner[3, 0] -= corner * PROJECTOR[0]
+    H = cv2.getPerspectiveTransform(inner, outer)
+    found = attempt(
+        [
+            dataclasses.replace(o, projector=cv2.perspectiveTransform(o.projector[None], H)[0])
+            for o in observations(9)
+        ]
+    )
+    assert found.verdict.level == level
+    assert "board-size" not in found.verdict.causes
+    if corner:
+        first = found.verdict.findings[0]
+        assert first.cause == "fringe-period" and "keystone" in first.remedy
+
+
+@pytest.mark.computes
+def test_a_telecentric_lens_is_not_taken_for_parallel_boards() -> None:
+    seen = [
+        dataclasses.replace(o, camera=move_points(T, o.points)[:, :2] * 890 / 600 + [203, 147])
+        for o, T in zip(observations(9), board_poses(9), strict=True)
+    ]
+    (finding,) = attempt(seen).verdict.findings
+    assert finding.severity == "rejected" and "telecentric" in finding.observation
+    parallel = []
+    for k in range(9):
+        T = board_poses(9)[0]
+        T[:3, 3] += [12.0 * k - 48, 8.0 * k - 32, 20.0 * k]
+        parallel.append(observation(TRUE, T, f"pose_{k:02d}"))
+    finding = attempt(parallel).verdict.findings[0]
+    assert finding.severity == "rejected" and "nearly parallel" in finding.observation
 
 
 @pytest.mark.computes

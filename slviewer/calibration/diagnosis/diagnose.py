@@ -21,7 +21,12 @@ from slviewer.calibration.diagnosis.rules import (
 from slviewer.calibration.diagnosis.solution import measure_solution
 from slviewer.calibration.known_camera import CameraCheck, KnownCamera
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.stereo import MIN_POSES, StereoModel, nominal_tilt_spread_deg
+from slviewer.calibration.stereo import (
+    MIN_POSES,
+    StereoModel,
+    foreshortened_tilt_deg,
+    nominal_tilt_spread_deg,
+)
 from slviewer.errors import CalibrationRejected
 from slviewer.records.verdict import Verdict
 from slviewer.target.board import Board
@@ -85,6 +90,7 @@ def calibrate_with_diagnosis(
         excluded=unfit,
         refusal=refusal,
         tilt_spread_deg=nominal_tilt_spread_deg(fit),
+        foreshortened_deg=foreshortened_tilt_deg(fit),
         solution=None if stereo is None else measure_solution(fit, stereo),
         is_camera_fixed=camera is not None and camera.is_fixed,
         camera=None if stereo is None else _check_camera(used, stereo, projector, board),

@@ -143,7 +143,8 @@ class Evidence:
     ``board``: its notation. ``excluded``: poses excluded before the fit, with the reason.
     ``refusal``: why no calibration could be made, or why it was rejected. ``contradiction``: why
     the sequence's description cannot be true. ``tilt_spread_deg``:
-    the largest angle between two boards, estimated with a nominal lens. ``camera``: of a camera
+    the largest angle between two boards, estimated with a nominal lens; ``foreshortened_deg``: by
+    their shapes alone. ``camera``: of a camera
     that is fixed, how the poses agree with it.
     """
 
@@ -154,6 +155,7 @@ class Evidence:
     refusal: CalibrationRejected | None = None
     contradiction: InputError | None = None
     tilt_spread_deg: float = np.nan
+    foreshortened_deg: float = 0.0
     solution: SolutionEvidence | None = None
     is_camera_fixed: bool = False
     camera: CameraCheck | None = None

@@ -18,7 +18,12 @@ from slviewer.calibration.observe import AXES
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.squareness import judge_squareness, nearest_aspect
-from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, MIN_TILT_SPREAD_DEG
+from slviewer.calibration.stereo import (
+    MAX_FOCAL_SIGMA,
+    MIN_POSES,
+    MIN_TILT_SPREAD_DEG,
+    describe_telecentric,
+)
 from slviewer.examination.findings import mirroring_remedy, reversed_axis
 from slviewer.fringe.response import gamma_from_harmonic
 from slviewer.fringe.sequence import Axis
@@ -235,10 +240,11 @@ def diagnose_mirroring(e: Evidence) -> Iterator[Finding]:
 
 
 def diagnose_period(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where the fringe period differs from its description.
+    """Yield a finding where the fringe period differs from its description, or the projector
+    distorts its image.
 
-    Evidence is the phase at the Gray code's edges, or the projector's aspect ratio by the
-    calibration.
+    Evidence is the phase at the Gray code's edges, or the projector's aspect ratio and the angle of
+    its rows and columns by the calibration.
     """
     if error := e.contradiction:
         remedy = error.remedy or "correct the sequence's description"
@@ -256,6 +262,16 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
             " the phase at the Gray code's edges",
             "correct period_px in the description, or project the patterns without scaling",
         )
+    elif e.solution is not None and (skew := e.solution.squareness) and skew.is_skewed:
+        is_wrong = e.solution.reprojection_px > HIGH_REPROJECTION_PX or _is_focal_unknown(e)
+        yield Finding(
+            "fringe-period",
+            "rejected" if is_wrong else "doubtful",
+            f"the projector's rows and columns are at {90 - skew.skew_deg:.1f}"
+            f" (+- {skew.skew_limit_deg:.1f}) degrees, as a projector's are that moves the corners"
+            " of its image",
+            "turn off the projector's keystone and corner correction, and capture the poses again",
+        )
     elif e.solution is not None and not e.tilts_undetermined:
         camera, aspect = e.solution.aspects
         # or of a stretched board, which both devices see
@@ -267,7 +283,7 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
                 f"the projector's rows appear {aspect:.2f} times as dense as its columns, as no"
                 " pixels are",
                 "compare the fringe period of each axis with its description, and turn off the"
-                " projector's scaling",
+                " projector's scaling and its keystone correction",
             )
 
 
@@ -493,6 +509,9 @@ def diagnose_parallel_poses(e: Evidence) -> Iterator[Finding]:
     if e.is_camera_fixed or not spread < MIN_TILT_DEG or len(e.usable) < MIN_POSES:
         return
     rejected = spread < MIN_TILT_SPREAD_DEG or solved is None or e.refusal or _is_focal_unknown(e)
+    if not solved and e.foreshortened_deg >= MIN_TILT_DEG:
+        yield Finding("parallel-poses", "rejected", *describe_telecentric(e.foreshortened_deg))
+        return
     text = (
         f"all {len(e.solution.used if e.solution else e.usable)} poses are nearly parallel "
         f"(tilts differ by {spread:.1f} degrees, and should by {MIN_TILT_DEG:.0f} at least)"

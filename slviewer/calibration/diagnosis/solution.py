@@ -8,14 +8,16 @@ response that is not linear puts harmonics h into the fringe, and n phase steps 
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from slviewer.calibration.board_pose import intersect_board, solve_pose
 from slviewer.calibration.diagnosis.evidence import ExcludedPose, Ripple, SolutionEvidence
 from slviewer.calibration.observe import AXES, Observation, Samples, combine_observed
-from slviewer.calibration.squareness import measure_squareness
+from slviewer.calibration.squareness import Squareness, measure_skew, measure_squareness
 from slviewer.calibration.stereo import DEVICES, StereoModel
+from slviewer.errors import CalibrationRejected
 from slviewer.fringe.image_area import ImageArea
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import fit_polynomial, fit_slopes, grid_points
@@ -30,6 +32,9 @@ ILLUMINATED_SHARE = 0.6
 """Least illuminated share of a corner for poses to be requested there."""
 EMPTY_SHARE = 0.3
 """A corner is empty where the poses cover less than this share of its illuminated part."""
+SKEWED_PX = 0.3
+"""Reprojection error of the projector above which its rows and columns may be other than at right
+angles: half a degree of that over 900 px leaves 0.6."""
 _GRID = 12  # test pixels along each side of a corner
 MAX_WAVES = 8
 """Largest number of waves per fringe period that is fitted."""
@@ -70,13 +75,29 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
         constant="" if area is None else area.describe(),
         aspects=(float(focal[0][1] / focal[0][0]), float(focal[1][1] / focal[1][0])),
         ripple=measure_ripple(used, stereo),
-        squareness=measure_squareness(
-            stereo.rig.camera,
-            [stereo.poses[o.name] for o in used],
-            [o.points for o in used],
-            pixels,
-        ),
+        squareness=_measure_squareness(used, stereo, pixels),
     )
+
+
+def _measure_squareness(
+    used: Sequence[Observation], stereo: StereoModel, pixels: Sequence[Floats]
+) -> Squareness:
+    """Measure whether pixels and cells are square; ``pixels`` (n, 2) of each pose's features.
+
+    The projector's skew is measured where its lens leaves more than noise: it takes as long as a
+    calibration of the camera.
+    """
+    points = [o.points for o in used]
+    poses = [stereo.poses[o.name] for o in used]
+    squareness = measure_squareness(stereo.rig.camera, poses, points, pixels)
+    if stereo.fixed_camera or stereo.reprojection_rms_px["projector"] < SKEWED_PX:
+        return squareness
+    projected = [o.projector for o in used]
+    try:
+        skew, limit = measure_skew(points, pixels, projected, stereo.rig.camera.size)
+    except CalibrationRejected:  # the camera alone has no solution
+        return squareness
+    return replace(squareness, skew_deg=skew, skew_limit_deg=limit)
 
 
 def measure_excluded(observation: Observation, stereo: StereoModel) -> ExcludedPose:
