@@ -24,11 +24,15 @@ from slviewer.evaluation.render import Row
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.operation import Progress
 from slviewer.pipeline.session_operations import SessionOperations
-from slviewer.pipeline.simulate import simulate
+from slviewer.pipeline.simulate import TARGET, simulate
 from slviewer.records.record import to_plain
 from slviewer.session.capture import Capture, NewCapture
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import demo_object
+from slviewer.simulation.plans import letter_plan
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.target.board import Board
 from tests.proofs.proof import BandCheck, Proof, prove_checks
 
 POSES = 8
@@ -62,6 +66,8 @@ RESAMPLED = {
     "axis", "axes", "depth_axis", "dropped", "left_out", "openings_mm", "strengths", "focal_px"
 }  # fmt: skip
 """Fields that name axes, or what the camera's or the projector's pixels and cells decide."""
+SUMS = {"features_excluded", "features_set_aside"}
+"""Fields that count over the features of all poses."""
 LENGTHS, SHARES = {"radius", "highest", "lowest"}, {"supported"}
 EXTREMES = {"farthest off"}
 """Quantities whose sign is that of the worst point."""
@@ -69,6 +75,10 @@ SIGMAS = {"sigma": 1.0, "sigma_shift_mm": 1.0, "U_mm": 0.5, "u_ppm": 1.0}
 """Fields that state the standard uncertainty of those beside them, and its share in them."""
 MOST_SIGMAS = 0.3
 """Of a figure's stated sigma, beside the law's own tolerance."""
+OTHER_FIT = 1.0
+"""The same where other features are excluded as outliers, or their noise is drawn anew."""
+AGAIN_SEED = 10_000
+"""Of the noise that is drawn anew, beside that of the capture."""
 COUNTED, LEAST_PX, LEAST_DEG = 3, 3e-3, 0.01
 """Points, pixels or features by which a count may differ, a length in px, and an angle,
 besides."""
@@ -82,9 +92,10 @@ class Law:
     are exchanged, a mirror image of the rig. ``repeats``: each pose is there twice. ``moves``: the
     nominal model lies elsewhere. ``resamples``: pixels are others, so that only lengths and words
     are compared. ``apart``: of two sessions, each computed by a process of its own.
+    ``renders``: what is there twice has noise of its own.
 
     ``tolerance``: relative change of a figure that the law leaves, where the change is not one of
-    units alone.
+    units alone; ``sigmas``: the same in standard deviations of the figure, where it states them.
     """
 
     name: str
@@ -98,6 +109,8 @@ class Law:
     moves: bool = False
     resamples: bool = False
     apart: bool = False
+    renders: bool = False
+    sigmas: float = MOST_SIGMAS
 
 
 def _reverse(name: str) -> str:
@@ -186,8 +199,21 @@ LAWS = (
     Law("world 50 times larger", 50.0),
     Law("poses in reverse order", rename=_reverse),
     Law("other names in another order", rename=_renumber),
-    Law("transposed and mirrored", transposes=True, tolerance=0.5, resamples=True),
+    Law(
+        "transposed and mirrored",
+        transposes=True,
+        tolerance=0.5,
+        resamples=True,
+        sigmas=OTHER_FIT,
+    ),
     Law("each pose twice", repeats=True),
+    Law(
+        "each pose twice, with new noise",
+        tolerance=0.35,
+        repeats=True,
+        renders=True,
+        sigmas=OTHER_FIT,
+    ),
     Law("nominal model elsewhere", moves=True),
     Law("two processes at once", apart=True, tolerance=1e-6),
     *(_of_bits(bits) for bits in (10, 12, 16)),
@@ -250,8 +276,12 @@ def run_operations(
     return found
 
 
-def change_session(base: Path, folder: Path, law: Law) -> None:
-    """Make a session of a base session's captures, changed by a law."""
+Render = Callable[[Capture], np.ndarray]
+
+
+def change_session(base: Path, folder: Path, law: Law, render: Render | None = None) -> None:
+    """Make a session of a base session's captures, changed by a law. ``render``: frames (n, h, w)
+    of a capture with new noise, for a law that renders."""
     with SessionOperations.open(base) as session, SessionOperations.create(folder) as changed:
         for role in ("calibration", "scan"):
             captures = sorted(
@@ -259,7 +289,7 @@ def change_session(base: Path, folder: Path, law: Law) -> None:
                     new
                     for each in session.captures(role)
                     if each.name not in UNUSED
-                    for new in _change(each, law)
+                    for new in _change(each, law, render)
                 ),
                 key=lambda new: new.name,
             )
@@ -267,7 +297,7 @@ def change_session(base: Path, folder: Path, law: Law) -> None:
             changed.save_captures(captures, role, board=board)
 
 
-def _change(capture: Capture, law: Law) -> Iterator[NewCapture]:
+def _change(capture: Capture, law: Law, render: Render | None) -> Iterator[NewCapture]:
     """Yield a capture changed by a law, of a pose that is repeated also its copy."""
     frames = np.ascontiguousarray(law.frames(np.asarray(capture.frames)))
     name, sequence = law.rename(capture.name), capture.sequence
@@ -282,6 +312,8 @@ def _change(capture: Capture, law: Law) -> Iterator[NewCapture]:
         sequence = PatternSequence.from_dict(description)
     yield NewCapture(name, sequence, frames)
     if law.repeats and name.startswith("pose"):
+        if law.renders and render is not None:
+            frames = render(capture)
         yield NewCapture(name + AGAIN, sequence, frames)
 
 
@@ -329,6 +361,8 @@ def _compare(
     ignored = IDENTITIES | COORDINATES
     if law.resamples or law.hides:
         ignored |= RESAMPLED
+    if law.renders:
+        ignored |= SUMS
     if path and path[-1] in ignored:
         return
     if isinstance(base, Mapping) and isinstance(changed, Mapping):
@@ -364,7 +398,7 @@ def _compare(
         if "_deg" in place:
             least = max(least, LEAST_DEG)
         if not abs(changed - wanted) <= max(
-            law.tolerance * abs(wanted), MOST_SIGMAS * sigma * law.scale**power, least
+            law.tolerance * abs(wanted), law.sigmas * sigma * law.scale**power, least
         ):
             yield Broken(place, changed, wanted)
     elif _words(base) != _words(changed):
@@ -421,6 +455,14 @@ def _run_laws(
     base = scratch / "base"
     simulate(base, scale=scale, poses=POSES, seed=seed)
     shape = demo_object(Pose(np.eye(3), np.zeros(3)))
+    rig = letter(scale, seed)
+    plan = letter_plan(rig, Board.parse(TARGET), POSES)
+
+    def render(capture: Capture) -> np.ndarray:
+        """Return the frames (n, h, w) of a capture with new noise."""
+        number = AGAIN_SEED + [*plan].index(capture.name)
+        return Renderer(rig, plan[capture.name]).capture(capture.sequence, number)
+
     for k, law in enumerate((Law("as it is"), *laws)):
         progress(k / (len(laws) + 1), law.name)
         folder, model = scratch / f"law_{k}", scratch / f"model_{k}.stl"
@@ -431,7 +473,7 @@ def _run_laws(
         trimesh.Trimesh(law.scale * place, triangles, process=False).export(model)
         folders = [folder] if not law.apart else [folder, scratch / f"other_{k}"]
         for each in folders:
-            change_session(base, each, law)
+            change_session(base, each, law, render)
         runs = [(each, law.scale, model, law.rename) for each in folders]
         if law.apart:
             with ProcessPoolExecutor(len(runs), get_context("spawn")) as processes:

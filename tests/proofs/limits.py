@@ -1,11 +1,13 @@
 """Rigs at their limits: projectors on any side and turned, small and large angles, tiny and large
-fields. Each measures planes as well as its noise allows, or is refused with what limits it."""
+fields, cameras with high pixels, telecentric and fisheye lenses, projectors that correct keystone.
+Each measures planes as well as its noise allows, or is refused with what limits it."""
 
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from slviewer.errors import SlviewerError
@@ -17,6 +19,7 @@ from slviewer.pipeline.session_operations import SessionOperations
 from slviewer.records.calibration import ModelCalibration
 from slviewer.session.capture import NewCapture
 from slviewer.simulation.boards import Pose, blank_board, printed_board
+from slviewer.simulation.lens import SimulatedLens
 from slviewer.simulation.plans import pose_at, rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
@@ -31,8 +34,50 @@ PLANES = {"plane_1": (540.0, 12.0, -8.0), "plane_2": (650.0, -10.0, 15.0)}
 """Depth, mm, and tilts, degrees."""
 MOST_FLOORS = 1.15
 """Largest RMS of the splined model's planes, in floors."""
+DEEPEST = 1.17
+"""Distance of the farthest board, in working distances."""
 MACRO = 8 / 380
 """Scale of a world in which a field of 380 mm is one of 8."""
+
+
+Corners = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LimitLens(SimulatedLens):
+    """A lens behind which a homography ``corrects`` (3, 3) keystone, from its pixels to those of
+    the image; where ``is_fisheye``, the distance from the image's centre grows with the angle, not
+    with its tangent."""
+
+    corrects: np.ndarray = field(default_factory=lambda: np.eye(3))
+    is_fisheye: bool = False
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) of points (..., 3) mm."""
+        if self.is_fisheye:
+            radius = np.linalg.norm(points[..., :2], axis=-1)
+            angle = np.arctan2(radius, points[..., 2])
+            # seen under this angle, at its tangent's place
+            points = np.concatenate(
+                [
+                    points[..., :2] * (angle / np.maximum(radius, 1e-12))[..., None],
+                    np.where(angle < np.pi / 2, 1.0, np.nan)[..., None],
+                ],
+                axis=-1,
+            )
+        pixels = super().project(points)
+        mapped = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1) @ self.corrects.T
+        return np.asarray(mapped[..., :2] / mapped[..., 2:])
+
+    def undistort(self, pixels: np.ndarray) -> np.ndarray:
+        """(x/z, y/z), (..., 2), that project to pixels (..., 2) of a lens without keystone; NaN
+        where a ray is at a right angle to the axis, or behind it."""
+        places = super().undistort(pixels)
+        if not self.is_fisheye:
+            return places
+        angle = np.linalg.norm(places, axis=-1)
+        angle[angle >= np.pi / 2] = np.nan
+        return np.asarray(places * (np.tan(angle) / np.maximum(angle, 1e-12))[..., None])
 
 
 @dataclass(frozen=True)
@@ -42,7 +87,11 @@ class Limit:
     its axis (180: upside down).
 
     ``scale`` of the world; ``defocus``: factor of the blur that depth makes; ``circles``: columns
-    and rows of the board.
+    and rows of the board. ``camera_mm``: the camera's distance, from which a longer or shorter lens
+    sees the same field; ``fisheye_deg``: the width that a fisheye sees there; ``pixel_height``:
+    height of the camera's pixels, in widths. ``keystone``: corners between which the projector
+    shows its image, in widths and heights of its own, in the order of reading. ``limited_by``: the
+    word that a refusal or a finding has to name, "" where the rig is as good as any.
     """
 
     around: float = 180.0
@@ -51,6 +100,17 @@ class Limit:
     scale: float = 1.0
     defocus: float = 1.0
     circles: tuple[int, int] = (21, 16)
+    camera_mm: float = WORKING_MM
+    fisheye_deg: float = 0.0
+    pixel_height: float = 1.0
+    keystone: Corners = ()
+    limited_by: str = ""
+
+    @property
+    def back_mm(self) -> float:
+        """How far the camera is behind the place that it has in the other rigs, in a world of
+        scale 1."""
+        return self.camera_mm - WORKING_MM
 
     def build(self, resolution: float, seed: int) -> tuple[SimulatedRig, list[Pose]]:
         """Return the rig, and poses of a board in its field."""
@@ -59,15 +119,64 @@ class Limit:
         away = np.array([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around)])
         centre = WORKING_MM * np.array([*away, 1 - np.cos(angle)])
         R = _aim(rig, centre, np.radians(self.roll))
-        rig = replace(rig, R=R, t=-R @ centre)
-        poses = target_poses(rig, Board("circles", *self.circles, PITCH_MM), POSES)
+        projector = _correct_keystone(rig.projector, self.keystone)
+        rig = replace(rig, R=R, t=-R @ centre, projector=projector)
+        poses = target_poses(
+            self._narrow_view(rig), Board("circles", *self.circles, PITCH_MM), POSES
+        )
+        back = np.array([0.0, 0.0, self.back_mm])
         light = replace(
             rig.light,
             focus_mm=rig.light.focus_mm * self.scale,
             defocus_px_mm=rig.light.defocus_px_mm * self.scale * self.defocus,
         )
-        rig = replace(rig, t=rig.t * self.scale, light=light)
-        return rig, [Pose(pose.R, pose.t * self.scale) for pose in poses]
+        rig = replace(
+            rig,
+            t=-R @ (centre + back) * self.scale,
+            camera=self._camera(rig.camera),
+            light=light,
+        )
+        return rig, [Pose(pose.R, (pose.t + back) * self.scale) for pose in poses]
+
+    def _narrow_view(self, rig: SimulatedRig) -> SimulatedRig:
+        """Return the rig with the camera of the other rigs, which sees no more than this one's at
+        any depth of a board: from afar, the field is as wide behind its middle as there."""
+        if self.camera_mm <= WORKING_MM:
+            return rig
+        (fx, fy), lens = rig.camera.focal_px, rig.camera
+        return replace(rig, camera=replace(lens, focal_px=(DEEPEST * fx, DEEPEST * fy)))
+
+    def _camera(self, lens: SimulatedLens) -> LimitLens:
+        """Return the camera's lens with this rig's distance, kind and pixels; its distortion is the
+        same on the image."""
+        longer, height = self.camera_mm / WORKING_MM, self.pixel_height
+        if self.fisheye_deg:
+            longer = lens.full_size[0] / np.radians(self.fisheye_deg) / lens.focal_px[0]
+        k1, k2, p1, p2, k3 = lens.brown
+        waves = lens.waves * [1, height, 1, 1, 1 / height, 1 / height]
+        (width, rows), (cx, cy) = lens.full_size, lens.centre_px
+        return LimitLens(
+            (width, round(rows / height)),
+            (lens.focal_px[0] * longer, lens.focal_px[1] * longer / height),
+            (cx, (cy + 0.5) / height - 0.5),
+            (k1 * longer**2, k2 * longer**4, p1 * longer, p2 * longer, k3 * longer**6),
+            waves,
+            lens.scale,
+            is_fisheye=self.fisheye_deg > 0,
+        )
+
+
+def _correct_keystone(lens: SimulatedLens, corners: Corners) -> SimulatedLens:
+    """Return a projector's lens whose image is shown between these corners of its panel."""
+    if not corners:
+        return lens
+    outer = np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) * lens.full_size - 0.5
+    inner = np.array(corners) * lens.full_size - 0.5
+    corrects = cv2.getPerspectiveTransform(inner.astype(np.float32), outer.astype(np.float32))
+    return LimitLens(
+        lens.full_size, lens.focal_px, lens.centre_px, lens.brown, lens.waves, lens.scale,
+        corrects=corrects,
+    )  # fmt: skip
 
 
 def _aim(rig: SimulatedRig, centre: np.ndarray, roll: float) -> np.ndarray:
@@ -96,6 +205,18 @@ RIGS: Mapping[str, Limit] = {
     "field of 8 mm": Limit(scale=MACRO),
     "field of 8 mm, out of focus": Limit(scale=MACRO, defocus=6),
     "field of 4 m": Limit(scale=4000 / 380),
+    "pixels twice as high": Limit(pixel_height=2),
+    "lens ten times as long": Limit(camera_mm=10 * WORKING_MM, circles=(14, 11)),
+    "telecentric lens": Limit(
+        camera_mm=1000 * WORKING_MM, circles=(14, 11), limited_by="telecentric"
+    ),
+    "fisheye of 120 degrees": Limit(
+        angle=60, camera_mm=0.3 * WORKING_MM, fisheye_deg=120, limited_by="fisheye"
+    ),
+    "keystone": Limit(keystone=((0.1, 0), (0.9, 0), (0, 1), (1, 1)), limited_by="keystone"),
+    "keystone of four corners": Limit(
+        keystone=((0.1, 0.02), (0.96, 0.08), (0, 0.94), (0.9, 1)), limited_by="keystone"
+    ),
 }
 
 
@@ -115,7 +236,11 @@ def measure_limit(limit: Limit, resolution: float, seed: int, folder: Path) -> R
     ]
     size = 220 * limit.scale, 176 * limit.scale
     planes = [
-        render(name, blank_board(pose_at((x, y, 0), (0, 0, z * limit.scale)), size), 50 + k)
+        render(
+            name,
+            blank_board(pose_at((x, y, 0), (0, 0, (z + limit.back_mm) * limit.scale)), size),
+            50 + k,
+        )
         for k, (name, (z, x, y)) in enumerate(PLANES.items())
     ]
     with SessionOperations.create(folder) as session:
@@ -152,6 +277,12 @@ def prove_limits(scale: float, seed: int, progress: Progress) -> Proof:
             progress(k / len(RIGS), name)
             row = measure_limit(limit, scale, seed, Path(scratch) / str(k))
             rows.append({"rig": name, **row})
+            text = f"{row.get('refused', '')} {row.get('findings', '')}"
+            if limit.limited_by:
+                is_named = float(limit.limited_by in text)
+                checks.append(BandCheck(name, f"{limit.limited_by} named", is_named, 1, 1))
+            else:
+                checks.append(BandCheck(name, "refused", float("refused" in row), 0, 0))
             if "ratio" in row:
                 what = "splined planes, in floors"
                 checks.append(BandCheck(name, what, float(row["ratio"]), 0.8, MOST_FLOORS))
