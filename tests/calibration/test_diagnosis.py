@@ -153,6 +153,14 @@ def test_a_projector_that_moves_its_corners_is_named(corner: float, level: str) 
 
 
 @pytest.mark.computes
+def test_places_captured_twice_are_no_more_poses() -> None:
+    places = board_poses(9)[::2]
+    seen = [observation(TRUE, T, f"pose_{k}") for k, T in enumerate([*places, *places])]
+    (finding,) = (f for f in attempt(seen).verdict.findings if f.cause == "too-few-poses")
+    assert not missing_facts(finding.observation, 10, 5, "places")
+
+
+@pytest.mark.computes
 def test_a_telecentric_lens_is_not_taken_for_parallel_boards() -> None:
     seen = [
         dataclasses.replace(o, camera=move_points(T, o.points)[:, :2] * 890 / 600 + [203, 147])

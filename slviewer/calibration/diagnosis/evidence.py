@@ -121,6 +121,7 @@ class SolutionEvidence:
     illuminates and no pose covers; ``aspects``: fy / fx of camera and projector; ``squareness``:
     of the camera's pixels and the board's cells. ``ripple``: residuals that repeat with the fringe,
     by axis. ``constant``: the pixels that change in no frame of any pose, "" without any.
+    ``places``: number of the poses, those at one place counted once; None in older evidence.
     """
 
     used: tuple[str, ...]
@@ -134,6 +135,7 @@ class SolutionEvidence:
     ripple: Mapping[Axis, Ripple] = field(default_factory=dict)
     squareness: Squareness | None = None
     constant: str = ""
+    places: int | None = None
 
 
 @dataclass(frozen=True)

@@ -483,19 +483,24 @@ def diagnose_single_poses(e: Evidence) -> Iterator[Finding]:
 
 
 def diagnose_pose_count(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where fewer poses are usable than a calibration needs."""
+    """Yield a finding where fewer poses are usable than a calibration needs; those at one place
+    count once."""
     usable = [pose.name for pose in e.usable if pose.name not in e.excluded]
     count = len(e.solution.used if e.solution else usable)
+    places = count
+    if e.solution and e.solution.places is not None:
+        places = e.solution.places
     needed = FEW_POSES_OF_PROJECTOR if e.is_camera_fixed else FEW_POSES
-    if count >= needed:
+    if places >= needed:
         return
     refused = {pose.name: pose.refused for pose in e.poses if pose.refused}
     because = "; ".join(f"{name}: {why}" for name, why in [*refused.items()][:3])
     wanted = needed if e.is_camera_fixed else POSES_FOR_PIXELWISE
     yield Finding(
         "too-few-poses",
-        "rejected" if count < MIN_POSES else "doubtful",
-        f"{count} usable pose{'s' * (count != 1)} of {len(e.poses)}{because and f' ({because})'}",
+        "rejected" if places < MIN_POSES else "doubtful",
+        f"{count} usable pose{'s' * (count != 1)} of {len(e.poses)}{because and f' ({because})'}"
+        + (f", at {places} place{'s' * (places != 1)}" if places < count else ""),
         f"capture the board in more positions and tilts: {wanted} poses at least",
         tuple(refused)[:3],
     )

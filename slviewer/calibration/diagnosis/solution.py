@@ -15,6 +15,7 @@ import numpy as np
 from slviewer.calibration.board_pose import intersect_board, solve_pose
 from slviewer.calibration.diagnosis.evidence import ExcludedPose, Ripple, SolutionEvidence
 from slviewer.calibration.observe import AXES, Observation, Samples, combine_observed
+from slviewer.calibration.pixelwise import list_twins
 from slviewer.calibration.squareness import Squareness, measure_skew, measure_squareness
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.errors import CalibrationRejected
@@ -76,6 +77,7 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
         aspects=(float(focal[0][1] / focal[0][0]), float(focal[1][1] / focal[1][0])),
         ripple=measure_ripple(used, stereo),
         squareness=_measure_squareness(used, stereo, pixels),
+        places=int(np.count_nonzero(list_twins(used, stereo) < 0)),
     )
 
 
