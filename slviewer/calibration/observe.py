@@ -36,14 +36,14 @@ from slviewer.target.detect import board_mask
 
 T = TypeVar("T")
 Result = TypeVar("Result")
-READING_VERSION = 8
+READING_VERSION = 9
 """Version of ``observe``; observations that a session saved with another version are computed
 again."""
 SAMPLES = 30_000
 """Largest number of pixels in one smoothing fit; more change the result by less than the noise."""
 AXES: tuple[Axis, ...] = ("x", "y")
 CELLS_PER_WIDTH = 14
-"""Spline cells across the image: half the wavelength of the finest relevant lens distortion."""
+"""Spline cells along the image's longer side: half the wavelength of the finest relevant lens distortion."""
 CLEARANCE_SIGMAS = 2.0
 """Distance from an edge, in standard deviations of its blur, beyond which a bright pixel's phase is
 undisturbed."""
@@ -403,7 +403,9 @@ def observe(
     for axis, phase in phases.items():
         weighted[axis] = phase.phase[part], _phase_weight(phase, bright[axis])[part]
         supported &= _is_near_bright(bright[axis], reach=typical_pitch)
-    across = width if area is None else area.box[2] - area.box[0]
+    whole = (0, 0, width, height) if area is None else area.box
+    side = int(height > width)  # a camera on its side has the same cells as one upright
+    across = whole[2 + side] - whole[side]
     surfaces = smooth_axes(weighted, box, across, typical_pitch, smoothing or Smoothing())
     return Observation(
         name=name,
@@ -479,7 +481,7 @@ def smooth_axes(
     """Fit a smooth surface to a board's absolute phase in each axis (step 2).
 
     ``weighted``: phase (v1 - v0, u1 - u0) rad and its weight over the ``box`` (u0, v0, u1, v1);
-    ``width`` of the image and ``pitch`` of the board in px.
+    ``width``: of the image's longer side, and ``pitch`` of the board, in px.
     """
     u0, v0, u1, v1 = box
     extent = (u0 - 0.5, v0 - 0.5, u1 - 0.5, v1 - 0.5)

@@ -178,7 +178,7 @@ def make_calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledA
         ones,
     )
     near, far = 200.0, 1000.0
-    step = max(2, -(-width // GRID_CELLS_ACROSS))
+    step = max(2, -(-max(width, height) // GRID_CELLS_ACROSS))
     grid = np.zeros(((height - 1) // step + 2, (width - 1) // step + 2, DEPTHS), np.float32)
     centred = np.stack([500 + 16 * u, 0.45 * ones, -1e-4 * ones]).astype(np.float32)
     compiled = CompiledAxis(centred, 455.5, grid, grid, step, near, far)

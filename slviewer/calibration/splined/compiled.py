@@ -27,7 +27,7 @@ from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rigid import Floats, Floats32, Mask
 
 GRID_CELLS_ACROSS = 100
-"""Number of grid cells across the image's width: 16 px each at a width of 1600."""
+"""Number of grid cells along the image's longer side: 16 px each at 1600."""
 DEPTHS = 65
 MAX_CORRECTION = 0.02
 """Largest correction over the depth range; beyond it, the coordinate is nearly constant or not
@@ -114,7 +114,7 @@ def compile_axis(
     coefficients = np.empty((3, height, width), np.float32)
     ray = rig, row, centre, near, far
     run_rows(_fit_rational, height, *ray, rays, coefficients)
-    step = max(2, -(-width // GRID_CELLS_ACROSS))
+    step = max(2, -(-max(width, height) // GRID_CELLS_ACROSS))
     shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
     grid, projected = np.full(shape, np.nan, np.float32), np.full((*shape, 2), np.nan)
     run_rows(_tabulate, shape[0], *ray, step, grid, projected)
