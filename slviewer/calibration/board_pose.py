@@ -14,6 +14,11 @@ from slviewer.geometry.vectors import diagonal
 ITERATIONS = 200
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
 """Where OpenCV's calibrations end."""
+GROUPS = 10
+"""Largest number of calibrations without some of the pictures, whose spread is the uncertainty of
+all."""
+MIN_SPREAD_POSES = 3
+"""Least number of pictures that each of those calibrations has."""
 _DIAGONAL = 225.0
 """Of every board, in the unit in which OpenCV solves: where its steps end depends on that."""
 
@@ -109,3 +114,23 @@ def solve_device(
     poses = [transform_from_rvec(r, unit * t) for r, t in zip(rvecs, tvecs, strict=True)]
     fx, fy = deviations.ravel()[:2].tolist()
     return SolvedDevice(K, D.ravel()[:5], size, poses, (fx, fy))
+
+
+def measure_focal_spread(points: list[Floats], pixels: list[Floats], lens: Lens) -> float:
+    """Return the relative standard deviation of the focal length by calibrations without some
+    pictures each (jackknife); 0 where too few would remain.
+
+    What Brown's polynomial lacks makes residuals depend on each other: their number understates
+    the uncertainty.
+    """
+    count = len(points)
+    groups = min(count, GROUPS)
+    if count - -(-count // groups) < MIN_SPREAD_POSES:
+        return 0.0
+    focal = []
+    for k in range(groups):
+        kept = [i for i in range(count) if i % groups != k]
+        fewer, seen = ([each[i] for i in kept] for each in (points, pixels))
+        K = solve_device("camera", fewer, seen, lens.size, lens).K
+        focal.append(float(np.mean(np.diag(K)[:2] / np.diag(lens.K)[:2])))
+    return float(np.sqrt(groups - 1) * np.std(focal))

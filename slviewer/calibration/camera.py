@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.board_pose import solve_device
+from slviewer.calibration.board_pose import measure_focal_spread, solve_device
 from slviewer.calibration.centres import centroid_shifts
 from slviewer.calibration.diagnosis.rules import (
     FEW_POSES,
@@ -16,7 +16,7 @@ from slviewer.calibration.diagnosis.rules import (
 )
 from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY
 from slviewer.calibration.squareness import judge_squareness, measure_squareness
-from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, MIN_POSES, check_pose_count
+from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, check_pose_count
 from slviewer.fringe.sequence import Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import Floats, largest_angle_deg, move_points
@@ -27,10 +27,6 @@ from slviewer.target.board import Board, Detection
 MAX_ERROR_RATIO = 3.0
 """Times the usual reprojection error, from which a picture is named: it was blurred, or its board
 bent or moved."""
-
-GROUPS = 10
-"""Largest number of calibrations without some of the pictures, whose spread is the uncertainty of
-all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +112,7 @@ def calibrate_camera(
         ]
         solved = solve_device("camera", points, pixels, size)
     lens, poses = solved.lens, solved.poses
-    spread = _focal_spread(points, pixels, lens)
+    spread = measure_focal_spread(points, pixels, lens)
     fx, fy = np.maximum(solved.focal_sigma_px, spread * np.diag(lens.K)[:2]).tolist()
     residuals = [
         lens.project(move_points(T, X)) - measured
@@ -138,26 +134,6 @@ def calibrate_camera(
     if constant:
         findings.append(describe_constant_pixels(constant))
     return replace(unjudged, verdict=Verdict.of(findings))
-
-
-def _focal_spread(points: list[Floats], pixels: list[Floats], lens: Lens) -> float:
-    """Return the relative standard deviation of the focal length by calibrations without some
-    pictures each (jackknife); 0 where too few would remain.
-
-    What Brown's polynomial lacks makes residuals depend on each other: their number understates
-    the uncertainty.
-    """
-    count = len(points)
-    groups = min(count, GROUPS)
-    if count - -(-count // groups) < MIN_POSES:
-        return 0.0
-    focal = []
-    for k in range(groups):
-        kept = [i for i in range(count) if i % groups != k]
-        fewer, seen = ([each[i] for i in kept] for each in (points, pixels))
-        K = solve_device("camera", fewer, seen, lens.size, lens).K
-        focal.append(float(np.mean(np.diag(K)[:2] / np.diag(lens.K)[:2])))
-    return float(np.sqrt(groups - 1) * np.std(focal))
 
 
 def _judge_camera(solved: CameraCalibration, poses: list[Floats]) -> Iterator[Finding]:

@@ -43,7 +43,8 @@ SAMPLES = 30_000
 """Largest number of pixels in one smoothing fit; more change the result by less than the noise."""
 AXES: tuple[Axis, ...] = ("x", "y")
 CELLS_PER_WIDTH = 14
-"""Spline cells along the image's longer side: half the wavelength of the finest relevant lens distortion."""
+"""Spline cells along the image's longer side: half the wavelength of the finest relevant lens
+distortion."""
 CLEARANCE_SIGMAS = 2.0
 """Distance from an edge, in standard deviations of its blur, beyond which a bright pixel's phase is
 undisturbed."""

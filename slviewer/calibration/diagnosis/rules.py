@@ -277,9 +277,11 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
         # or of a stretched board, which both devices see
         errors = [each / nearest_aspect(each) - 1 for each in (aspect, aspect / camera)]
         if min(map(abs, errors)) > MAX_ASPECT_ERROR:
+            # tilts that leave no focal length unknown, unless the projector moves its image
+            is_wrong = e.solution.tilt_spread_deg >= MIN_TILT_DEG and _is_focal_unknown(e)
             yield Finding(
                 "fringe-period",
-                "doubtful",
+                "rejected" if is_wrong else "doubtful",
                 f"the projector's rows appear {aspect:.2f} times as dense as its columns, as no"
                 " pixels are",
                 "compare the fringe period of each axis with its description, and turn off the"
