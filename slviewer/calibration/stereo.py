@@ -330,7 +330,8 @@ def _solve_both(
         solved = solve_device(device, points, images, size, start)
         sigma[device] = max(solved.focal_sigma_px)
         if solved.K[0, 0] > LONG_LENS * max(size):
-            spread = measure_focal_spread(points, images, solved.lens)
+            lens = _make_lens(solved.K, solved.D, size)
+            spread = measure_focal_spread(points, images, lens)
             sigma[device] = max(sigma[device], spread * float(solved.K[0, 0]))
         if strict:
             _check_focal(device, sigma[device], solved.K)
@@ -362,17 +363,23 @@ def _solve_both(
         # systematic errors, which the standard deviations lack, change the two fits differently
         change = np.abs(f / np.diag(K) - 1).max()
         sigma[device] = max(sigma[device], float(change * min(K[0, 0], K[1, 1])))
-    try:
-        lenses = Lens(K_c, D_c, sizes[0]), Lens(K_p, D_p, sizes[1])
-    except InputError as error:  # as of boards without perspective, whose focal length is infinite
-        raise CalibrationRejected(
-            f"the poses give the devices lenses that cannot be ({error.observation})",
-            "tilt the board by 15 to 30 degrees in different directions, and use lenses with"
-            " perspective",
-        ) from error
+    lenses = _make_lens(K_c, D_c, sizes[0]), _make_lens(K_p, D_p, sizes[1])
     rig = StereoRig(*lenses, R, unit * T)
     poses = [transform_from_rvec(r, unit * t) for r, t in zip(rvecs, tvecs, strict=True)]
     return rig, poses, sigma
+
+
+def _make_lens(K: np.ndarray, D: np.ndarray, size: Size) -> Lens:
+    """Return a lens; raises CalibrationRejected where it cannot be, as of boards without
+    perspective, whose focal length is infinite."""
+    try:
+        return Lens(K, D, size)
+    except InputError as error:
+        raise CalibrationRejected(
+            f"the poses give a device a lens that cannot be ({error.observation})",
+            "tilt the board by 15 to 30 degrees in different directions, and use lenses with"
+            " perspective",
+        ) from error
 
 
 def _check_focal(device: str, sigma_px: float, K: Floats) -> None:

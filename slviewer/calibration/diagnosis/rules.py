@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from msgspec import structs
 
-from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
+from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence, SolutionEvidence
 from slviewer.calibration.known_camera import MAX_FOCAL_UNCERTAINTY, CameraCheck, judge_camera
 from slviewer.calibration.observe import AXES
 from slviewer.calibration.pixelwise import POSES_FOR_PIXELWISE
@@ -262,8 +262,16 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
             " the phase at the Gray code's edges",
             "correct period_px in the description, or project the patterns without scaling",
         )
-    elif e.solution is not None and (skew := e.solution.squareness) and skew.is_skewed:
-        is_wrong = e.solution.reprojection_px > HIGH_REPROJECTION_PX or _is_focal_unknown(e)
+    elif e.solution is not None:
+        yield from _judge_projected_image(e, e.solution)
+
+
+def _judge_projected_image(e: Evidence, solution: SolutionEvidence) -> Iterator[Finding]:
+    """Yield a finding where the projector's rows and columns, by the calibration, are not at right
+    angles, or not as dense as any pixels are."""
+    is_unknown = _is_focal_unknown(e)
+    if (skew := solution.squareness) and skew.is_skewed:
+        is_wrong = solution.reprojection_px > HIGH_REPROJECTION_PX or is_unknown
         yield Finding(
             "fringe-period",
             "rejected" if is_wrong else "doubtful",
@@ -272,21 +280,23 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
             " of its image",
             "turn off the projector's keystone and corner correction, and capture the poses again",
         )
-    elif e.solution is not None and not e.tilts_undetermined:
-        camera, aspect = e.solution.aspects
-        # or of a stretched board, which both devices see
-        errors = [each / nearest_aspect(each) - 1 for each in (aspect, aspect / camera)]
-        if min(map(abs, errors)) > MAX_ASPECT_ERROR:
-            # tilts that leave no focal length unknown, unless the projector moves its image
-            is_wrong = e.solution.tilt_spread_deg >= MIN_TILT_DEG and _is_focal_unknown(e)
-            yield Finding(
-                "fringe-period",
-                "rejected" if is_wrong else "doubtful",
-                f"the projector's rows appear {aspect:.2f} times as dense as its columns, as no"
-                " pixels are",
-                "compare the fringe period of each axis with its description, and turn off the"
-                " projector's scaling and its keystone correction",
-            )
+        return
+    if e.tilts_undetermined:
+        return
+    camera, aspect = solution.aspects
+    # or of a stretched board, which both devices see
+    errors = [each / nearest_aspect(each) - 1 for each in (aspect, aspect / camera)]
+    if min(map(abs, errors)) > MAX_ASPECT_ERROR:
+        # tilts that leave no focal length unknown, unless the projector moves its image
+        is_wrong = solution.tilt_spread_deg >= MIN_TILT_DEG and is_unknown
+        yield Finding(
+            "fringe-period",
+            "rejected" if is_wrong else "doubtful",
+            f"the projector's rows appear {aspect:.2f} times as dense as its columns, as no"
+            " pixels are",
+            "compare the fringe period of each axis with its description, and turn off the"
+            " projector's scaling and its keystone correction",
+        )
 
 
 def _describe_wrong_period(e: Evidence, axis: Axis) -> str:
