@@ -38,10 +38,10 @@ BAND_BYTES = 2**27
 """Memory for the band of image rows that is fitted at a time; the band is narrower the more poses
 there are."""
 MIN_POSES = 4
+"""One pose more than coefficients, so that the fit's RMS is meaningful."""
 SAME_PLACE = 0.01
 """Largest distance of a feature from its place in another pose, over the board's diagonal, with
 which the board did not move between them: 2 mm of 225."""
-"""One pose more than coefficients, so that the fit's RMS is meaningful."""
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better
 default."""
