@@ -503,8 +503,8 @@ def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained:
         return rated.net > limits.EXPLAINED_BY_MOTION * rated.comparison.loss
     if rated.net + gained > limits.EXPLAINED * rated.comparison.loss:
         return True
-    if len(rated.hypotheses) > 1 or rated.comparison.left > limits.UNREADABLE:
-        return False
+    if len(rated.hypotheses) > 1 or rated.comparison.left > limits.LEFT_BESIDE:
+        return False  # what hardly improves all images cannot be what is wrong with them
     return bool(np.nansum(after) < limits.LEFT_OF_FRAMES * np.nansum(before))
 
 

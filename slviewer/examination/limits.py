@@ -98,6 +98,9 @@ EXPLAINED = 0.25
 """Share of the misfit that it must explain, or ..."""
 LEFT_OF_FRAMES = 0.6
 """... of the residual of the frames that it moves that may be left: noise is."""
+LEFT_BESIDE = 0.25
+"""Misfit of all images that may be left beside few frames which a hypothesis moves: images in a
+random order left 0.46 where two of them were exchanged."""
 LEFT_BY_EXPLAINING = 0.25
 """Share of the misfit that a hypothesis may leave beside which only those are tried that leave as
 little of pixels matched alone; measured, frames out of order leave 0.17 at most."""

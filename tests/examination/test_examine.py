@@ -472,7 +472,8 @@ def test_a_dim_wall_does_not_decide() -> None:
 def test_frames_of_no_pattern_that_was_described_are_unreadable() -> None:
     sequence, frames = captured("complementary")
     order = np.random.default_rng(3).permutation(len(frames))
-    assert "unreadable" in [cause for cause, _ in causes(sequence, frames[order])]
+    found = examine(sequence, frames[order]).rejected
+    assert "unreadable" in [f.cause for f in found], [f.observation for f in found]
 
 
 @pytest.mark.parametrize("amplitude", [100.0, 130.0])
