@@ -269,6 +269,8 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
 def _judge_projected_image(e: Evidence, solution: SolutionEvidence) -> Iterator[Finding]:
     """Yield a finding where the projector's rows and columns, by the calibration, are not at right
     angles, or not as dense as any pixels are."""
+    if e.tilts_undetermined:  # as of a telecentric lens
+        return
     is_unknown = _is_focal_unknown(e)
     if (skew := solution.squareness) and skew.is_skewed:
         is_wrong = solution.reprojection_px > HIGH_REPROJECTION_PX or is_unknown
@@ -280,8 +282,6 @@ def _judge_projected_image(e: Evidence, solution: SolutionEvidence) -> Iterator[
             " of its image",
             "turn off the projector's keystone and corner correction, and capture the poses again",
         )
-        return
-    if e.tilts_undetermined:
         return
     camera, aspect = solution.aspects
     # or of a stretched board, which both devices see
