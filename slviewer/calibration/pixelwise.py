@@ -230,7 +230,7 @@ def list_twins(used: Sequence[Observation], stereo: StereoModel) -> np.ndarray:
     """Return of each pose the last one before it at the same place, (n,) int64; -1 without any.
 
     What a pose at the place of another shows of a pixel's curve is the same: two places that were
-    captured twice are no four.
+    captured twice remain two.
     """
     boards = [move_points(stereo.poses[o.name], o.points) for o in used]
     twins = np.full(len(used), -1)

@@ -3,8 +3,8 @@ at right angles.
 
 A print that is stretched in one direction gives a camera focal lengths that differ in x and y, as
 pixels that are not square do; nearly all cameras have square ones. Only tilts of the board tell the
-two apart, or the projector, which sees the same print. Rows and columns that are not at right
-angles are no projector's: its image is moved at the corners, as a correction of keystone does.
+two apart, or the projector, which sees the same print. Where a projector's rows and columns are not
+at right angles, the corners of its image were moved, as a correction of keystone does.
 """
 
 from collections.abc import Iterator, Sequence

@@ -62,6 +62,11 @@ class Hypothesis:
         return self.cause == "frame-lag" and not self.frames
 
     @property
+    def is_late_from_one(self) -> bool:
+        """Whether the images are late from one on, which repeats the one before."""
+        return self.cause == "frame-lag" and bool(self.frames)
+
+    @property
     def loses_images(self) -> bool:
         """Whether no image shows one of the pattern frames."""
         return any(self.images[i] is None for i in self.changed)

@@ -254,7 +254,7 @@ def _list_likely(
         and not r.hypotheses[0].loses_images
     ]
     best = first.hypotheses[0]
-    is_seen = best.cause == "frame-lag" and bool(best.frames)  # as an image that repeats another
+    is_seen = best.is_late_from_one  # as an image that repeats another
     least = 0.0 if is_seen or not best.loses_images else first.comparison.left + limits.LEFT_ALIKE
     whole = [r for r in rivals if r.comparison.left < least and not r.hypotheses[0].is_of_files]
     alike = first.comparison.left + limits.LEFT_ALIKE
@@ -375,14 +375,14 @@ def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") ->
     """Return an explanation; of lags that begin at about equally likely frames, the one whose image
     repeats the one before it most closely."""
     first = found.hypotheses[0]
-    if first.cause != "frame-lag" or not first.frames:
+    if not first.is_late_from_one:
         return found.hypotheses
     rivals = [
         h
         for each in rated
         if each.comparison.left < found.most_left
         for h in each.hypotheses[:1]
-        if h.cause == "frame-lag" and h.frames
+        if h.is_late_from_one
     ]
     return (min(rivals, key=lambda h: _repetition(evaluator, h)),)
 
@@ -390,7 +390,7 @@ def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") ->
 def _repetition(evaluator: Evaluator, hypothesis: Hypothesis) -> float:
     """Return the mean squared difference, in squares of the pixels' ranges, of the image from which
     on all are late and the one before, which it repeats; 0 for another hypothesis."""
-    if hypothesis.cause != "frame-lag" or not hypothesis.frames:
+    if not hypothesis.is_late_from_one:
         return 0.0
     sample, (k,) = next(iter(evaluator.sample.by_axis.values())), hypothesis.frames
     squares = (sample.levels[k, 1] - sample.levels[k - 1, 1]) ** 2
@@ -399,8 +399,7 @@ def _repetition(evaluator: Evaluator, hypothesis: Hypothesis) -> float:
 
 def _is_repeated(evaluator: Evaluator, hypothesis: Hypothesis) -> bool:
     """Return whether images are late from one on that is the same as the one before."""
-    is_lag = hypothesis.cause == "frame-lag" and bool(hypothesis.frames)
-    return is_lag and _repetition(evaluator, hypothesis) < limits.SAME
+    return hypothesis.is_late_from_one and _repetition(evaluator, hypothesis) < limits.SAME
 
 
 def _explain_by_one(
